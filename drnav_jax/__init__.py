@@ -1,0 +1,1 @@
+"""DR. Nav in JAX."""

@@ -1,0 +1,302 @@
+"""Closed-loop evaluation: scenes with trips -> batched episodes -> records. What `drnav run` and the experiments share."""
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from drnav_jax import metrics, navigator, worlds
+from drnav_jax.models import geometric, oracle, silent
+from drnav_jax.navigator import NavParams, NavSpec
+from drnav_jax.planning.compositions import planner
+from drnav_jax.planning.goal_generator import GeneratorSpec
+from drnav_jax.sim import episode
+from drnav_jax.sim.episode import EpisodeParams, EpisodeSpec
+from drnav_jax.sim.lidar import LidarParams
+from drnav_jax.types import GridMap, RobotParams
+from drnav_jax.worlds import Scene
+from drnav_jax.worlds.labels import LabelSpec, dead_ends
+
+PREDICTORS = ("geometric", "oracle", "none")
+LABEL_RESOLUTION = 0.1  # [m] labels need no finer grid
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """One evaluation's robot, sensors and limits; the defaults are the design's.
+
+    Attributes:
+        planner: A row of `planning.compositions`.
+        predictor: Where dead-end evidence comes from: geometric, oracle or none.
+        risk_weight: Lambda of eq. 7 and of the route's cell cost; None = the planner's default.
+        horizon: H [s]; None = the planner's default.
+        robot_radius: [m].
+        max_speed: [m/s].
+        lidar_range: [m].
+        goal_tolerance: [m]; None = the world's own, else 0.75.
+        time_limit: [s]; None = the world's own, else `limit_factor` times the optimal time, at least 60 s.
+        limit_factor: See `time_limit`.
+        num_candidates: Candidates of the goal generator, controls and headings together.
+        seed: Of sensor noise.
+    """
+
+    planner: str = "drnav"
+    predictor: str = "geometric"
+    risk_weight: float | None = None
+    horizon: float | None = None
+    robot_radius: float = 0.25
+    max_speed: float = 1.0
+    lidar_range: float = 12.0
+    goal_tolerance: float | None = None
+    time_limit: float | None = None
+    limit_factor: float = 6.0
+    num_candidates: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        planner(self.planner)
+        if self.predictor not in PREDICTORS:
+            raise ValueError(f'There is no predictor "{self.predictor}": choose from {", ".join(PREDICTORS)}.')
+        rules = {
+            "robot_radius": (0.05, 0.4, "m"), "max_speed": (0.05, 3.0, "m/s"), "lidar_range": (1.0, 12.0, "m"),
+            "goal_tolerance": (0.05, 10.0, "m"), "time_limit": (1.0, 1e5, "s"), "horizon": (0.5, 4.0, "s"),
+            "risk_weight": (0.0, 1e3, ""), "limit_factor": (1.0, 1e3, ""),
+        }  # fmt: skip
+        for name, (low, high, unit) in rules.items():
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and low <= value <= high):
+                raise ValueError(f"{name} must lie within {low}..{high} {unit}".rstrip() + f", got {value}.")
+        if self.num_candidates < 320:
+            raise ValueError(f"num_candidates must be >= 320, got {self.num_candidates}.")
+
+
+class Trip(NamedTuple):
+    """A scene that can be driven, with what is known of it beforehand."""
+
+    scene: Scene
+    shortest: float  # [m] at the planning margin
+    path: np.ndarray  # [L, 2] corners of the shortest way
+    time_limit: float  # [s]
+    goal_tolerance: float  # [m]
+
+
+@functools.cache
+def spec_of(planner_name: str, predictor: str, num_candidates: int) -> NavSpec:
+    """The robot's spec: 256 headings, the other candidates are controls."""
+    predict = {"geometric": geometric.predict, "oracle": oracle.predict, "none": silent.predict}[predictor]
+    speeds = 12 if num_candidates < 2048 else 16
+    generator = GeneratorSpec(num_speeds=speeds, num_turns=(num_candidates - 256) // speeds, num_headings=256)
+    return NavSpec(planner=planner(planner_name), predictor=predict, generator=generator)
+
+
+@functools.cache
+def policy_of(spec: NavSpec) -> episode.Policy:
+    """The navigator as the simulator wants it; it logs mode, g*, EDE, P_dead and recoveries of every tick."""
+
+    def init(params: NavParams, pose: jax.Array) -> navigator.NavState:
+        return navigator.init(spec, params, pose)
+
+    def step(params: NavParams, state: navigator.NavState, observation: Any, key: Any, replan: bool) -> tuple:
+        state, command, info = navigator.step(spec, params, state, observation, key, replan=replan)
+        log = {
+            "mode": info.mode, "local_goal": info.local_goal.xy, "exposure": info.local_goal.exposure,
+            "p_dead": info.p_dead, "recoveries": info.recoveries, "certified": info.track.certified,
+        }  # fmt: skip
+        return state, command, log
+
+    return episode.Policy(init=init, step=step)
+
+
+def plan_margin(params: NavParams) -> float:
+    """The outermost planning margin beyond the radius [m]: what the optimal time is computed with."""
+    return float(params.route.margin)
+
+
+def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:
+    """Check that every scene's trip can be driven, and what would be optimal.
+
+    Raises:
+        ValueError: If a start or goal is not free, or no way joins them; says where and what to do.
+    """
+    margin = plan_margin(NavParams())
+    trips = []
+    for scene in scenes:
+        try:
+            shortest, path = worlds.check_trip(scene, setup.robot_radius, setup.robot_radius + margin)
+        except ValueError:  # narrower than the planner likes, but perhaps not than the robot is
+            shortest, path = worlds.check_trip(scene, setup.robot_radius)
+        limit = setup.time_limit or scene.time_limit
+        limit = limit or max(60.0, setup.limit_factor * shortest / setup.max_speed)
+        tolerance = setup.goal_tolerance or scene.goal_tolerance or 0.75
+        trips.append(Trip(scene, shortest, path, limit, tolerance))
+    return trips
+
+
+def label_map(trip: Trip, radius: float) -> GridMap:
+    """Trip-conditioned true labels (`worlds.labels`) as the oracle reads them: 1 = dead end.
+
+    Labels are defined where a robot's centre may be; they are grown by its radius so that they fill their pockets.
+    """
+    from scipy import ndimage
+
+    scene = trip.scene
+    occupied, resolution, field = scene.occupied, scene.resolution, None
+    if resolution < LABEL_RESOLUTION - 1e-6:
+        shape = tuple(int(n * resolution / LABEL_RESOLUTION) for n in occupied.shape)
+        centres = [((np.arange(n) + 0.5) * LABEL_RESOLUTION / resolution - 0.5) for n in shape]
+        fine = worlds.signed_distance(occupied, resolution)
+        field = ndimage.map_coordinates(fine, np.meshgrid(*centres, indexing="ij"), order=1, mode="nearest")
+        occupied, resolution = field <= 0, LABEL_RESOLUTION
+    cells = worlds.trip_cells(trip.path, scene.origin, resolution)
+    inside = np.all((cells >= 0) & (cells < np.asarray(occupied.shape)), axis=1)
+    mouth = 5.0 if scene.outside_is_free else 2.5
+    spec = LabelSpec(radius=radius, mouth=mouth)
+    label = dead_ends(occupied, resolution, spec, trip_path=cells[inside]).label
+    grown = ndimage.distance_transform_edt(~label) * resolution <= radius if label.any() else label
+    # growing must not reach out of the mouth: only over cells where no robot's centre can be
+    clearance = ndimage.distance_transform_edt(~occupied) * resolution if occupied.any() else np.full(label.shape, 9.0)
+    filled = label | (grown & (clearance <= radius + 0.5 * resolution))
+    return GridMap(
+        values=filled.astype(np.float32),
+        origin=np.asarray(scene.origin, np.float32),
+        resolution=np.asarray(resolution, np.float32),
+    )
+
+
+def params_of(setup: Setup) -> NavParams:
+    """The navigator's parameters under this setup, before any world is known."""
+    params = NavParams()
+    robot = RobotParams(radius=setup.robot_radius, v_max=setup.max_speed)
+    score, route = params.score, params.route
+    if setup.risk_weight is not None:
+        score = score._replace(risk_weight=setup.risk_weight)
+        route = route._replace(risk_weight=setup.risk_weight)
+    if setup.horizon is not None:
+        score = score._replace(horizon=setup.horizon)
+    occupancy = params.filter.occupancy._replace(max_range=setup.lidar_range)
+    predictor: Any = {
+        "geometric": geometric.GeometricParams(radius=setup.robot_radius), "oracle": None, "none": None,
+    }[setup.predictor]  # fmt: skip
+    return params._replace(
+        robot=robot, score=score, route=route, predictor=predictor,
+        filter=params.filter._replace(occupancy=occupancy),
+    )  # fmt: skip
+
+
+def _stack(trees: list[Any]) -> Any:
+    return jax.tree.map(lambda *a: np.stack([np.asarray(x, np.float32) for x in a]), *trees)
+
+
+def _pad_maps(maps: list[GridMap]) -> list[GridMap]:
+    h, w = (max(m.values.shape[a] for m in maps) for a in (0, 1))
+    pad = lambda v: np.pad(v, ((0, h - v.shape[0]), (0, w - v.shape[1])))  # noqa: E731
+    return [m._replace(values=pad(m.values)) for m in maps]
+
+
+def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = None) -> EpisodeParams:
+    """The batch of episodes `[B, ...]`; `params` overrides the setup's parameters (its predictor's stay)."""
+    params = params_of(setup) if params is None else params
+    each = [
+        params._replace(goal_tolerance=t.goal_tolerance) for t in trips
+    ]
+    if setup.predictor == "oracle":
+        labels = _pad_maps([label_map(t, setup.robot_radius) for t in trips])
+        each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
+    batch = len(trips)
+    spread = lambda tree: _stack([tree] * batch)  # noqa: E731
+    return EpisodeParams(
+        world=worlds.stack_worlds([t.scene.world for t in trips]),
+        start=np.asarray([t.scene.start for t in trips], np.float32),
+        goal=np.asarray([t.scene.goal for t in trips], np.float32),
+        time_limit=np.asarray([t.time_limit for t in trips], np.float32),
+        goal_tolerance=np.asarray([t.goal_tolerance for t in trips], np.float32),
+        robot=spread(params.robot),
+        policy=_stack(each),
+        lidar=spread(LidarParams(max_range=setup.lidar_range)),
+        faults=spread(episode.FaultParams()),
+    )
+
+
+class Evaluation(NamedTuple):
+    """What a batch of episodes gave."""
+
+    records: list[dict[str, Any]]  # of the finished episodes, in the order of the trips
+    summary: dict[str, Any]
+    trips: list[Trip]  # the finished ones
+    result: episode.Result
+    interrupted: bool
+    wall_s: float
+
+
+def evaluate(
+    trips: list[Trip],
+    setup: Setup,
+    *,
+    params: NavParams | None = None,
+    progress: Callable[[int], None] | None = None,
+    spec: EpisodeSpec = EpisodeSpec(),  # noqa: B008 (immutable)
+) -> Evaluation:
+    """Drive every trip once, in one batch.
+
+    Args:
+        trips: From `prepare`.
+        setup: Robot, planner, predictor.
+        params: Overrides the setup's navigator parameters.
+        progress: Called with the number of finished episodes.
+        spec: Sizes of the simulation.
+
+    Raises:
+        ValueError: If there is no trip.
+        KeyboardInterrupt: If interrupted before any episode was finished.
+    """
+    if not trips:
+        raise ValueError("there is no trip to drive.")
+    begin = time.perf_counter()
+    batch = episode_params(trips, setup, params)
+    keys = jax.random.split(jax.random.key(setup.seed), len(trips))
+    policy = policy_of(spec_of(setup.planner, setup.predictor, setup.num_candidates))
+    result = episode.run(spec, policy, batch, keys, progress=progress)
+    kept = [k for k in range(len(trips)) if result.finished[k]]
+    if not kept:
+        raise KeyboardInterrupt
+    records = [_record(trips[k], result, k, setup.max_speed) for k in kept]
+    return Evaluation(
+        records=records,
+        summary=metrics.summary(records, [trips[k].time_limit for k in kept]),
+        trips=[trips[k] for k in kept],
+        result=result,
+        interrupted=len(kept) < len(trips),
+        wall_s=time.perf_counter() - begin,
+    )
+
+
+def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[str, Any]:
+    state, scene = result.state, trip.scene
+    assert scene.start is not None and scene.goal is not None
+    ticks = int(result.log.active[k].sum())
+    return metrics.episode(
+        world=scene.name,
+        success=bool(state.success[k]),
+        collision=bool(state.collision[k]),
+        time=ticks * EpisodeSpec().dt,
+        distance=float(state.distance[k]),
+        away=float(state.retreat[k]),
+        clearance=float(state.min_clearance[k]),
+        recoveries=int(result.log.policy["recoveries"][k, max(ticks - 1, 0)]),
+        shortest=trip.shortest,
+        straight=math.dist(scene.start[:2], scene.goal),
+        v_max=v_max,
+        reference_length=scene.reference_length,
+    )
+
+
+def path_driven(result: episode.Result, k: int, start: tuple[float, float, float]) -> np.ndarray:
+    """The path `[T, 2]` of episode k as it was driven [m]."""
+    poses = result.log.pose[k][result.log.active[k]]
+    return np.concatenate([np.asarray(start, np.float32)[None, :2], poses[:, :2]])

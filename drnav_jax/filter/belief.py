@@ -1,0 +1,150 @@
+"""What the robot believes about its surroundings: occupancy and dead ends on one rolling window.
+
+The window is aligned with odom and moves by whole strides of cells, so beliefs are moved and never
+blurred; what rolls in is unknown (never seen, log-odds 0, dead-end belief at its prior l_0).
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drnav_jax import geometry
+from drnav_jax.filter import dead_end, occupancy
+from drnav_jax.filter.dead_end import DeadEndParams
+from drnav_jax.filter.occupancy import OccupancyParams
+from drnav_jax.types import Evidence, GridSpec, LocalMap, Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class FilterSpec:
+    """Sizes of the belief.
+
+    Attributes:
+        grid: The rolling window.
+        num_bearings: Bins of the polar profile that clears cells; at most the number of azimuths
+            of the LiDAR, or bins stay empty and clear nothing.
+    """
+
+    grid: GridSpec = GridSpec()
+    num_bearings: int = 180
+
+    def __post_init__(self) -> None:
+        """Check sizes."""
+        if self.num_bearings < 8:
+            raise ValueError(f"num_bearings must be >= 8 bins, got {self.num_bearings}.")
+
+
+class FilterParams(NamedTuple):
+    """Parameters of both beliefs."""
+
+    occupancy: OccupancyParams = OccupancyParams()
+    dead_end: DeadEndParams = DeadEndParams()
+
+
+class FilterState(NamedTuple):
+    """The belief on the window."""
+
+    occupancy: Array  # [H, W] log-odds of being occupied [nat]; 0 where never seen
+    seen: Array  # [H, W] bool, observed since the window holds the cell
+    dead_end: Array  # [H, W] log-odds of being a dead end [nat]
+    corner: Array  # [2] int32 (row, column) of cell (0, 0) on the odom lattice
+
+
+@partial(jax.jit, static_argnames="spec")
+def init(spec: FilterSpec, params: FilterParams, xy: Float[Array, "2"]) -> FilterState:
+    """A belief that knows nothing, on the window around `xy` (odom) [m]."""
+    shape = spec.grid.shape
+    return FilterState(
+        occupancy=jnp.zeros(shape, jnp.float32),
+        seen=jnp.zeros(shape, bool),
+        dead_end=jnp.full(shape, dead_end.prior_log_odds(params.dead_end)),
+        corner=geometry.window_corner(xy, spec.grid),
+    )
+
+
+@partial(jax.jit, static_argnames="spec")
+def move(spec: FilterSpec, params: FilterParams, state: FilterState, xy: Float[Array, "2"]) -> FilterState:
+    """Re-centre the window on `xy` (odom) [m] by whole strides; costs nothing while it stays.
+
+    (Under vmap both branches run: the shift is then paid in every call.)
+    """
+    corner = geometry.window_corner(xy, spec.grid)
+    by = corner - state.corner
+
+    def moved(state: FilterState) -> FilterState:
+        return FilterState(
+            occupancy=geometry.shift(state.occupancy, by, 0.0),
+            seen=geometry.shift(state.seen, by, 0.0),
+            dead_end=geometry.shift(state.dead_end, by, dead_end.prior_log_odds(params.dead_end)),
+            corner=corner,
+        )
+
+    return jax.lax.cond(jnp.any(by != 0), moved, lambda state: state, state)
+
+
+def local_map(spec: FilterSpec, state: FilterState) -> LocalMap:
+    """The occupancy belief as predictors and planners read it."""
+    return LocalMap(
+        occupancy=state.occupancy,
+        seen=state.seen,
+        origin=geometry.window_origin(state.corner, spec.grid),
+        resolution=jnp.asarray(spec.grid.resolution, jnp.float32),
+    )
+
+
+@partial(jax.jit, static_argnames="spec")
+def observe(
+    spec: FilterSpec,
+    params: FilterParams,
+    state: FilterState,
+    pose: Float[Array, "3"],
+    points: Float[Array, "P 3"],
+    point_valid: Bool[Array, " P"],
+) -> tuple[FilterState, Bool[Array, "H W"]]:
+    """Move the window to the robot and fold in one LiDAR scan taken there.
+
+    Args:
+        spec: Sizes.
+        params: Parameters of the belief.
+        state: The belief so far.
+        pose: Robot pose (x, y, yaw) in odom at the time of the scan.
+        points: Scan in base_link, z up from the ground [m].
+        point_valid: False for beams that gave no reading.
+
+    Returns:
+        The new belief, and which cells this scan has seen.
+    """
+    state = move(spec, params, state, pose[:2])
+    origin = geometry.window_origin(state.corner, spec.grid)
+    resolution = spec.grid.resolution
+    hit, crossed = occupancy.observed(
+        params.occupancy,
+        spec.grid.shape,
+        origin,
+        resolution,
+        pose,
+        points,
+        point_valid,
+        spec.num_bearings,
+    )
+    belief, seen = occupancy.apply(
+        params.occupancy, state.occupancy, state.seen, origin, resolution, pose, hit, crossed
+    )
+    return state._replace(occupancy=belief, seen=seen), hit | crossed
+
+
+@jax.jit
+def assimilate(
+    params: FilterParams,
+    state: FilterState,
+    evidence: Evidence,
+    visible: Bool[Array, "H W"],
+    dt: Scalar,
+) -> FilterState:
+    """Fold dead-end evidence into the belief (eq. 5); see `dead_end.update`."""
+    belief = dead_end.update(params.dead_end, state.dead_end, evidence, visible, dt)
+    return state._replace(dead_end=belief)

@@ -1,0 +1,324 @@
+"""The whole robot as two pure functions: `init` and `step`.
+
+    perceive   sensors -> filter: occupancy, and (when replanning) the predictor's dead-end evidence     (eq. 4-6)
+    replan     filter -> risk P_dead^foot, cost-to-go, recovery points; every 5th tick
+    act        goal generator (eq. 7-9) -> g* -> DWA with a braking certificate -> command
+
+This is the one place that joins models, filter and planning. Nothing branches on values in Python, nothing raises inside:
+broken sensor values are masked, a broken pose stops the robot, and every command is finite and within the limits.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from drnav_jax import geometry, grids
+from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief, dead_end
+from drnav_jax.filter import recovery as recovery_points
+from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
+from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
+from drnav_jax.models import geometric
+from drnav_jax.planning import costmap, dynamics, goal_generator, route, tracker
+from drnav_jax.planning import recovery as behaviour
+from drnav_jax.planning.compositions import Composition
+from drnav_jax.planning.goal_generator import GeneratorSpec, LocalGoal
+from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
+from drnav_jax.planning.route import RouteParams, RouteSpec
+from drnav_jax.planning.scoring import ScoreParams
+from drnav_jax.planning.tracker import Track, TrackerParams, TrackerSpec
+from drnav_jax.types import Command, Evidence, GridMap, LocalMap, Observation, RobotParams, Scalar
+
+_NO_PLAN = -(1 << 16)  # the word of a cell that has only just come into the window: no risk, the worst value
+
+Predictor = Callable[[Any, Observation, LocalMap], Evidence]
+
+
+@dataclasses.dataclass(frozen=True)
+class NavSpec:
+    """Everything that fixes shapes and composition.
+
+    Attributes:
+        filter: The rolling window and the scan's bins.
+        planner: Which parts the planner is composed of.
+        predictor: Dead-end evidence from an observation and the local map.
+        generator: Candidates of the goal generator.
+        tracker: Samples of the DWA.
+        route: Resolution of the cost-to-go.
+        recovery_points: Capacity of the recovery points' store.
+        local_cells: Edge of the square around the robot that rollouts may use [cells].
+        dt: Tick [s].
+        replan_every: Ticks per replan.
+    """
+
+    filter: FilterSpec = FilterSpec()
+    planner: Composition = Composition()
+    predictor: Predictor = geometric.predict
+    generator: GeneratorSpec = GeneratorSpec()
+    tracker: TrackerSpec = TrackerSpec()
+    route: RouteSpec = RouteSpec()
+    recovery_points: RecoverySpec = RecoverySpec()
+    local_cells: int = 128
+    dt: float = 0.1
+    replan_every: int = 5
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit together."""
+        shape = self.filter.grid.shape
+        if self.local_cells % 2 or not 16 <= self.local_cells <= min(shape):
+            raise ValueError(f"local_cells must be even and within 16..{min(shape)}, got {self.local_cells}.")
+        if any(n % self.route.pooling for n in shape):
+            raise ValueError(f"the window {shape} must be a multiple of route.pooling = {self.route.pooling} cells.")
+        if self.dt <= 0 or self.replan_every < 1:
+            raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
+        if not self.planner.controls and self.generator.num_speeds:
+            object.__setattr__(self, "generator", dataclasses.replace(self.generator, num_speeds=0))
+
+
+class NavParams(NamedTuple):
+    """Everything that may be swept."""
+
+    robot: RobotParams = RobotParams()
+    filter: FilterParams = FilterParams()
+    score: ScoreParams = ScoreParams()
+    route: RouteParams = RouteParams()
+    tracker: TrackerParams = TrackerParams()
+    recovery: RecoveryParams = RecoveryParams()
+    recovery_points: RecoveryPointParams = RecoveryPointParams()
+    predictor: Any = geometric.GeometricParams()
+    hysteresis: Scalar = 0.3  # [] advantage of the last g* [m]
+    goal_tolerance: Scalar = 0.75  # [] nearer than this the robot has arrived and stops [m]
+    pose_jump: Scalar = 1.0  # [] the map is dropped when odometry leaps farther than this in one tick [m]
+
+
+class NavState(NamedTuple):
+    """What the robot carries from tick to tick."""
+
+    belief: FilterState
+    plan: Array  # [H, W] int32 words of `costmap.pack_plan`
+    reachable: Array  # [] bool, a way to the goal is known or may exist
+    risk: Array  # [H, W] P_dead^foot above the prior
+    points: RecoveryPoints
+    recovery: RecoveryState
+    local_goal: Array  # [2] the last g* [m]
+    last_pose: Array  # [3] the last finite pose
+    last_command: Array  # [2] v, omega
+    time: Array  # [] [s]
+
+
+class Info(NamedTuple):
+    """What one looks at, per tick."""
+
+    local_goal: LocalGoal  # g*, its score, EDE, and the weighted terms of the score
+    track: Track  # the command's certificate
+    mode: Array  # [] int32, `planning.recovery.MODES`
+    arrived: Array  # [] bool
+    recoveries: Array  # [] int32, how often recovery began
+    p_dead: Array  # [] P_dead under the robot
+    clearance: Array  # [] clearance as the map has it [m]
+    fault: Array  # [] bool: pose not finite or leapt, or no valid scan
+
+
+@partial(jax.jit, static_argnames="spec")
+def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
+    """A robot that knows nothing yet.
+
+    Args:
+        spec: Sizes and composition.
+        params: Parameters.
+        pose: Where it stands in odom (x, y, yaw).
+    """
+    shape = spec.filter.grid.shape
+    pose = jnp.where(jnp.all(jnp.isfinite(pose)), pose, 0.0)
+    return NavState(
+        belief=belief.init(spec.filter, params.filter, pose[:2]),
+        plan=jnp.zeros(shape, jnp.int32),
+        reachable=jnp.asarray(True),
+        risk=jnp.zeros(shape, jnp.float32),
+        points=recovery_points.init(spec.recovery_points),
+        recovery=behaviour.init(spec.filter.grid, pose[:2]),
+        local_goal=pose[:2],
+        last_pose=pose,
+        last_command=jnp.zeros(2, jnp.float32),
+        time=jnp.zeros((), jnp.float32),
+    )
+
+
+def _sane(params: NavParams, state: NavState, seen: Observation) -> tuple[Observation, Array, Array]:
+    """The observation with broken values replaced; whether the pose is usable, whether it leapt."""
+    pose_ok = jnp.all(jnp.isfinite(seen.pose))
+    pose = jnp.where(pose_ok, seen.pose, state.last_pose)
+    leap = jnp.hypot(pose[0] - state.last_pose[0], pose[1] - state.last_pose[1]) > params.pose_jump
+    twist_ok = jnp.all(jnp.isfinite(seen.twist))
+    valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok
+    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3))
+    return (
+        seen._replace(
+            pose=pose,
+            twist=jnp.where(twist_ok, seen.twist, state.last_command),
+            points=jnp.where(valid[:, None], seen.points, 0.0),
+            point_valid=valid,
+            images=jnp.where(image_ok[:, None, None, None], seen.images, 0.0),
+            image_valid=seen.image_valid & image_ok,
+            goal=jnp.where(jnp.all(jnp.isfinite(seen.goal)), seen.goal, pose[:2]),
+        ),
+        pose_ok,
+        leap,
+    )
+
+
+def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observation, leap: Array) -> NavState:
+    """Move the window and fold the scan in; after a leap of odometry the old map is dropped first."""
+    fresh = lambda: belief.init(spec.filter, params.filter, seen.pose[:2])  # noqa: E731
+    kept = jax.lax.cond(leap, fresh, lambda: state.belief)
+    moved, _ = belief.observe(spec.filter, params.filter, kept, seen.pose, seen.points, seen.point_valid)
+    by = moved.corner - state.belief.corner
+
+    def shifted() -> tuple[Array, Array, Array]:
+        return (
+            geometry.shift(state.plan, by, _NO_PLAN),
+            geometry.shift(state.risk, by, 0.0),
+            geometry.shift(state.recovery.visits, by, 0.0),
+        )
+
+    unmoved = lambda: (state.plan, state.risk, state.recovery.visits)  # noqa: E731
+    plan, risk, visits = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
+    return state._replace(belief=moved, plan=plan, risk=risk, recovery=state.recovery._replace(visits=visits))
+
+
+def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation) -> NavState:
+    """Evidence -> belief -> risk; recovery points; cost-to-go."""
+    grid, planner, robot = spec.filter.grid, spec.planner, params.robot
+    local = belief.local_map(spec.filter, state.belief)
+    nothing = jnp.zeros(grid.shape, jnp.float32)
+    held, risk = state.belief, nothing
+    if planner.risk_in_route or planner.exposure:
+        evidence = spec.predictor(params.predictor, seen, local)
+        everywhere = jnp.ones(grid.shape, bool)  # where it has nothing to say its confidence is 0
+        held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)
+        risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
+    clear = costmap.clearance(local.seen & (local.occupancy > 0), grid.resolution)
+    goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
+    retreating = recover.mode == behaviour.RETREAT
+    if planner.recovery:
+        x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
+        here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
+        room = local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here)
+        points = recovery_points.observe(
+            spec.recovery_points, params.recovery_points, points, local, dead_end.probability(held.dead_end),
+            grids.flood_fill(room, here), state.time,
+        )  # fmt: skip
+        goal = jnp.where(retreating, recover.target, goal)
+    if planner.needs_route or planner.recovery:
+        priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
+        found = route.solve(
+            spec.route, params.route, clear, priced, jnp.where(retreating, 0.0, visits), local.origin,
+            grid.resolution, seen.pose[:2], goal, robot,
+        )  # fmt: skip
+        value, reachable = found.value, found.reachable
+    else:
+        value, reachable = nothing, jnp.asarray(True)
+    exposed = risk
+    if planner.progress == "straight":
+        direct = route.straight(grid.shape, local.origin, grid.resolution, seen.goal)
+        value, reachable = jnp.where(retreating, value, direct), reachable | ~retreating
+        exposed = jnp.maximum(risk, visits)  # no route that visits could be priced in: they count as exposure
+    exposed = exposed if planner.exposure else nothing
+    return state._replace(
+        belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, points=points
+    )
+
+
+def _act(
+    spec: NavSpec, params: NavParams, state: NavState, seen: Observation, healthy: Array, leap: Array
+) -> tuple[NavState, Command, Info]:
+    """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
+    grid, robot, planner = spec.filter.grid, params.robot, spec.planner
+    pose, twist, time = seen.pose, seen.twist, state.time
+    h, w = grid.shape
+    n = spec.local_cells
+    top, left = (h - n) // 2, (w - n) // 2
+    window = belief.local_map(spec.filter, state.belief)
+    crop = lambda a: a[top : top + n, left : left + n]  # noqa: E731
+    corner = window.origin + jnp.asarray([left, top], jnp.float32) * grid.resolution
+    clear = costmap.clearance(crop(window.seen & (window.occupancy > 0)), grid.resolution)
+    local = GridMap(clear, corner, grid.resolution)
+    field = GridMap(costmap.pack_clearance(crop(state.plan), clear), corner, grid.resolution)
+
+    recover = state.recovery
+    heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)
+    if planner.generates:
+        choice = goal_generator.generate(
+            spec.generator, params.score, robot, field, pose, twist, heading_for, state.local_goal,
+            jnp.asarray(params.hysteresis, jnp.float32),
+        )  # fmt: skip
+    else:
+        choice = goal_generator.given(seen.goal)
+    if planner.recovery:
+        visited = GridMap(recover.visits, window.origin, grid.resolution)
+        points = state.points
+        refuge, has_refuge = behaviour.choose(
+            params.recovery, points.xy, points.rank, points.valid,
+            geometry.sample_nearest(visited, points.xy, fill=0.0), pose[:2],
+        )  # fmt: skip
+        recover = behaviour.update(
+            grid, params.recovery, recover, time, spec.dt, pose[:2], window.origin, choice.valid, state.reachable,
+            refuge, has_refuge,
+        )  # fmt: skip
+    track = tracker.track(
+        spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, recover.mode == behaviour.CLEAR
+    )
+    arrived = jnp.hypot(seen.goal[0] - pose[0], seen.goal[1] - pose[1]) <= params.goal_tolerance
+    halt = arrived | ~healthy | (recover.mode == behaviour.STOP)
+    stop = dynamics.limit(0.0, 0.0, twist, robot, spec.dt)
+    command = jax.tree.map(lambda a, b: jnp.where(halt, a, b), stop, track.command)
+    info = Info(
+        local_goal=choice,
+        track=track,
+        mode=recover.mode,
+        arrived=arrived,
+        recoveries=recover.entries,
+        p_dead=dead_end.probability(
+            geometry.sample_nearest(GridMap(state.belief.dead_end, window.origin, grid.resolution), pose[:2])
+        ),
+        clearance=geometry.sample_bilinear(local, pose[:2]),
+        fault=~healthy | leap | ~jnp.any(seen.point_valid),
+    )
+    state = state._replace(
+        recovery=recover,
+        local_goal=choice.xy,
+        last_pose=pose,
+        last_command=jnp.stack([command.v, command.omega]),
+        time=time + spec.dt,
+    )
+    return state, command, info
+
+
+@partial(jax.jit, static_argnames=("spec", "replan"))
+def step(
+    spec: NavSpec, params: NavParams, state: NavState, observation: Observation, key: PRNGKeyArray, *, replan: bool
+) -> tuple[NavState, Command, Info]:
+    """One tick of the robot.
+
+    Args:
+        spec: Sizes and composition (static).
+        params: Parameters; sweep them without compiling again.
+        state: What the robot carried over.
+        observation: What its sensors say now; missing sensors are masked, non-finite values count as missing.
+        key: Randomness (the DWA planners use none).
+        replan: Also update the dead-end belief, the cost-to-go and the recovery points; every
+            `spec.replan_every`-th tick, the first included (static).
+
+    Returns:
+        The new state, the command (finite, within speed and acceleration limits) and what one looks at.
+    """
+    del key
+    seen, healthy, leap = _sane(params, state, observation)
+    state = _perceive(spec, params, state, seen, leap)
+    if replan:
+        state = _replan(spec, params, state, seen)
+    return _act(spec, params, state, seen, healthy, leap)

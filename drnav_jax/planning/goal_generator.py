@@ -1,0 +1,159 @@
+"""The short-horizon goal generator (paper, section IV-D, eq. 7-9).
+
+All admissible controls theta = (v, omega) are rolled out over H from the robot's speed, and beside them a family of
+straight headings in all directions; each is scored by `scoring`, and g* is the end of the best (eq. 9). The last g* and
+the goal are headings of their own, so a choice is kept unless something is better by the hysteresis.
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drnav_jax import geometry
+from drnav_jax.planning import dynamics, scoring
+from drnav_jax.planning.dynamics import Motion
+from drnav_jax.planning.scoring import BLOCKED, Candidates, ScoreParams, Terms
+from drnav_jax.types import GridMap, RobotParams
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratorSpec:
+    """How many candidates, and how they are rolled out.
+
+    Attributes:
+        num_speeds: Levels of v among the controls; 0 leaves the controls out.
+        num_turns: Levels of omega among the controls.
+        num_headings: Straight headings (two of them point to the last g* and to the goal).
+        dt: Step of the rollout [s].
+        num_steps: Steps rolled out; `ScoreParams.horizon` may use fewer.
+    """
+
+    num_speeds: int = 16
+    num_turns: int = 240
+    num_headings: int = 256
+    dt: float = 0.1
+    num_steps: int = 40
+
+    def __post_init__(self) -> None:
+        """Check counts."""
+        if min(self.num_speeds, self.num_turns) < 0 or self.num_headings < 3:
+            raise ValueError(
+                "num_speeds and num_turns must be >= 0 and num_headings >= 3, "
+                f"got {self.num_speeds}, {self.num_turns}, {self.num_headings}."
+            )
+        if self.dt <= 0 or self.num_steps < 1:
+            raise ValueError(f"dt must be > 0 s and num_steps >= 1, got {self.dt} and {self.num_steps}.")
+
+    @property
+    def num_candidates(self) -> int:
+        """K, all candidates together."""
+        return self.num_speeds * self.num_turns + self.num_headings
+
+
+class LocalGoal(NamedTuple):
+    """The generator's choice and why."""
+
+    xy: Float[Array, "2"]  # g* in odom [m]
+    valid: Bool[Array, ""]  # False: every candidate is blocked, g* is the robot's own place
+    score: Float[Array, ""]  # Score(g*)
+    exposure: Float[Array, ""]  # EDE of the chosen path
+    geometric: Float[Array, ""]  # J_geom of the chosen path
+    terms: Terms  # weighted terms of the chosen score, [1] each
+    index: Array  # [] int32, which candidate
+
+
+def candidates(
+    spec: GeneratorSpec,
+    params: ScoreParams,
+    robot: RobotParams,
+    pose: Float[Array, "3"],
+    twist: Float[Array, "2"],
+    goal: Float[Array, "2"],
+    last: Float[Array, "2"],
+    hysteresis: Array,
+) -> Candidates:
+    """The K candidates: controls first, then headings, then the last g*, then the goal."""
+    controls = spec.num_speeds * spec.num_turns
+    fan = spec.num_headings - 2
+    share = (jnp.arange(controls, dtype=jnp.float32) // max(spec.num_turns, 1) + 1.0) / max(spec.num_speeds, 1)
+    turn = jnp.linspace(-1.0, 1.0, max(spec.num_turns, 1), dtype=jnp.float32)
+    v = share * robot.v_max
+    w = jnp.tile(turn, spec.num_speeds)[:controls] * robot.w_max
+    targets = jnp.stack([last, goal]) - pose[None, :2]
+    yaw = jnp.concatenate(
+        [jnp.arange(fan, dtype=jnp.float32) * (2 * jnp.pi / fan), jnp.arctan2(targets[:, 1], targets[:, 0])]
+    )
+    span = jnp.sqrt(jnp.sum(targets * targets, axis=-1))
+    reach = jnp.concatenate([jnp.full(fan, jnp.float32(1.0)) * params.range_max, span])
+    # a heading is a ray: it is walked at the pace that covers range_max within the horizon
+    pace = jnp.full(spec.num_headings, jnp.float32(1.0)) * params.range_max / params.horizon
+    ends = jnp.minimum(reach, params.range_max)
+    pace = jnp.where(jnp.arange(spec.num_headings) >= fan, ends / params.horizon, pace)
+    # near the last g* there is nothing left to hold on to, or the robot would settle there
+    held = hysteresis * jnp.square(jnp.clip(span[0] / params.range_min, 0.0, 1.0))
+    here = dynamics.start(pose, twist, controls)
+    none = jnp.zeros(spec.num_headings, jnp.float32)
+    rays = Motion(x=none + pose[0], y=none + pose[1], c=jnp.cos(yaw), s=jnp.sin(yaw), v=pace, w=none)
+    join = lambda a, b: jnp.concatenate([a, b])  # noqa: E731
+    one = jnp.zeros(controls, jnp.float32)
+    return Candidates(
+        motion=jax.tree.map(join, here, rays),
+        v=join(v, pace),
+        w=join(w, none),
+        turned=join(one, jnp.abs(geometry.wrap_angle(yaw - pose[2]))),
+        reach=join(one + params.range_max, reach),
+        bias=join(one, none.at[fan].set(-held)),
+    )
+
+
+def given(xy: Float[Array, "2"]) -> LocalGoal:
+    """A local goal that nobody generated: planners without a generator track the mission's goal itself."""
+    zero = jnp.zeros((), jnp.float32)
+    return LocalGoal(
+        xy=xy, valid=jnp.asarray(True), score=zero, exposure=zero, geometric=zero,
+        terms=Terms(*[zero[None]] * len(Terms._fields)), index=jnp.asarray(-1, jnp.int32),
+    )  # fmt: skip
+
+
+@partial(jax.jit, static_argnames="spec")
+def generate(
+    spec: GeneratorSpec,
+    params: ScoreParams,
+    robot: RobotParams,
+    field: GridMap,
+    pose: Float[Array, "3"],
+    twist: Float[Array, "2"],
+    goal: Float[Array, "2"],
+    last: Float[Array, "2"],
+    hysteresis: Float[Array, ""],
+) -> LocalGoal:
+    """Choose g* (eq. 9).
+
+    Args:
+        spec: Candidates.
+        params: Weights.
+        robot: Radius and limits.
+        field: Packed words (`costmap`) in odom.
+        pose: Robot in odom.
+        twist: Its speeds.
+        goal: The mission's goal in odom [m].
+        last: The last g* [m].
+        hysteresis: Advantage of the last g* [m].
+    """
+    chosen_from = candidates(spec, params, robot, pose, twist, goal, last, hysteresis)
+    scores = scoring.score(field, chosen_from, params, robot, dt=spec.dt, num_steps=spec.num_steps)
+    index = jnp.argmin(scores.score).astype(jnp.int32)
+    best = scoring.at(scores, index)
+    terms = scoring.explain(
+        field, scoring.at(chosen_from, index), params, robot, dt=spec.dt, num_steps=spec.num_steps
+    )
+    valid = best.score[0] < BLOCKED
+    return LocalGoal(
+        xy=jnp.where(valid, jnp.stack([best.x[0], best.y[0]]), pose[:2]),
+        valid=valid, score=best.score[0], exposure=best.exposure[0], geometric=best.geometric[0],
+        terms=terms, index=index,
+    )  # fmt: skip

@@ -1,0 +1,151 @@
+"""Cost-to-go over the rolling window: where the goal is by way, not by air.
+
+Optimistic (unknown = free), on cells `pooling` times as coarse as the map's. A cell's cost per metre is
+
+    1 + w_i inflation / 252 + min(risk_weight * risk, risk_cap) + w_v visits
+
+so that the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the only way
+may look like a dead end. A goal outside the window is reached over the window's edge: an edge cell is worth its straight
+distance to the goal. If no way to a goal inside the window is known, edge cells are a last resort.
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drnav_jax import geometry, grids
+from drnav_jax.planning import costmap
+from drnav_jax.planning.costmap import InflationParams
+from drnav_jax.types import RobotParams, Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class RouteSpec:
+    """Resolution of the solve.
+
+    Attributes:
+        pooling: Map cells per cell of the route, along each axis.
+        max_iterations: Bound on the solver's sweeps.
+    """
+
+    pooling: int = 2
+    max_iterations: int = 1000
+
+    def __post_init__(self) -> None:
+        """Check sizes."""
+        if self.pooling < 1 or self.max_iterations < 1:
+            raise ValueError(f"pooling and max_iterations must be >= 1, got {self.pooling}, {self.max_iterations}.")
+
+
+class RouteParams(NamedTuple):
+    """What the route costs."""
+
+    margin: Scalar = 0.1  # [] beyond the radius: cells with less clearance are closed [m]
+    inflation_weight: Scalar = 0.5  # [] w_i
+    inflation: InflationParams = InflationParams(scaling=4.0, radius=1.0)
+    risk_weight: Scalar = 3.0  # [] lambda inside the cell cost
+    risk_cap: Scalar = 4.0  # [] most that risk adds to a metre
+    visit_weight: Scalar = 4.0  # [] w_v
+    escape_radius: Scalar = 0.6  # [] a robot that stands too close may pass closed free cells this near [m]
+    escape_cost: Scalar = 5.0  # [] per metre, through those
+    lost_penalty: Scalar = 100.0  # [] added to leaving the window when the goal is inside it [m]
+
+
+class Route(NamedTuple):
+    """The value-to-go and whether it exists where the robot is."""
+
+    value: Float[Array, "H W"]  # [m] on the map's cells; `UNREACHABLE` where there is no way
+    reachable: Bool[Array, ""]  # the robot has a way (possibly out of the window) to the goal
+
+
+def _pool(values: Array, by: int, reduce: str) -> Array:
+    h, w = values.shape
+    return getattr(jnp, reduce)(values.reshape(h // by, by, w // by, by), axis=(1, 3))
+
+
+def _spread(value: Array, by: int) -> Array:
+    """Coarse values on the fine cells: bilinear where all neighbours are reachable, else the cell's own."""
+    own = jnp.repeat(jnp.repeat(value, by, axis=0), by, axis=1)
+    h, w = value.shape
+    padded = jnp.pad(value, 1, mode="edge")
+    out = jnp.zeros_like(own).reshape(h, by, w, by)
+    for i in range(by):
+        for j in range(by):
+            di, dj = (i + 0.5) / by - 0.5, (j + 0.5) / by - 0.5
+            a, b = (1 if di > 0 else -1), (1 if dj > 0 else -1)
+            u, v = abs(di), abs(dj)
+            near_i, near_j = padded[1 + a : 1 + a + h, 1:-1], padded[1:-1, 1 + b : 1 + b + w]
+            near_ij = padded[1 + a : 1 + a + h, 1 + b : 1 + b + w]
+            mixed = (1 - u) * ((1 - v) * value + v * near_j) + u * ((1 - v) * near_i + v * near_ij)
+            worst = jnp.maximum(jnp.maximum(near_i, near_j), near_ij)
+            out = out.at[:, i, :, j].set(jnp.where(worst < 0.5 * grids.UNREACHABLE, mixed, value))
+    return jnp.where(own < 0.5 * grids.UNREACHABLE, out.reshape(own.shape), grids.UNREACHABLE)
+
+
+@partial(jax.jit, static_argnames=("spec", "resolution"))
+def solve(
+    spec: RouteSpec,
+    params: RouteParams,
+    clear: Float[Array, "H W"],
+    risk: Float[Array, "H W"],
+    visits: Float[Array, "H W"],
+    origin: Float[Array, "2"],
+    resolution: float,
+    xy: Float[Array, "2"],
+    goal: Float[Array, "2"],
+    robot: RobotParams,
+) -> Route:
+    """The optimistic cost-to-go on the window (module docstring).
+
+    Args:
+        spec: Resolution of the solve.
+        params: Costs.
+        clear: Clearance of each map cell [m]; unknown cells count as free.
+        risk: Dead-end risk of each map cell, 0..1 (all 0: plain cost-to-go).
+        visits: Where the robot got stuck before, 0..1.
+        origin: Odom position of the window's outer corner [m].
+        resolution: Edge of a map cell [m].
+        xy: Robot [m].
+        goal: Where to go [m].
+        robot: Its radius.
+    """
+    by, size = spec.pooling, resolution * spec.pooling
+    clear, risk, visits = _pool(clear, by, "max"), _pool(risk, by, "mean"), _pool(visits, by, "mean")
+    h, w = clear.shape
+    x, y = geometry.cell_centres((h, w), origin, size)
+    to_goal, to_robot = jnp.hypot(x - goal[0], y - goal[1]), jnp.hypot(x - xy[0], y - xy[1])
+    inscribed = robot.radius + params.margin
+    soft = jnp.minimum(costmap.inflation(clear, inscribed, params.inflation), 252.0) / 252.0
+    cost = (
+        1.0
+        + params.inflation_weight * soft
+        + jnp.minimum(params.risk_weight * risk, params.risk_cap)
+        + params.visit_weight * visits
+    )
+    closed = clear < inscribed
+    escape = (to_robot < params.escape_radius) & (clear > 0.5 * robot.radius)
+    cost = jnp.where(closed, jnp.where(escape, params.escape_cost, grids.UNREACHABLE), cost)
+    # a goal that lies nearer to a wall than the planning margin can still be approached
+    at_goal = to_goal <= 1.5 * size
+    cost = jnp.where(at_goal & (clear > 0), jnp.minimum(cost, params.escape_cost), cost)
+    row, col = jnp.arange(h)[:, None], jnp.arange(w)[None, :]
+    edge = (row == 0) | (row == h - 1) | (col == 0) | (col == w - 1)
+    held = geometry.inside(geometry.cell_of(goal, origin, size), (h, w))
+    far = jnp.where(edge, to_goal + jnp.where(held, params.lost_penalty, 0.0), grids.UNREACHABLE)
+    initial = jnp.where(held & at_goal, to_goal, far)
+    initial = jnp.where(cost < grids.UNREACHABLE, initial, grids.UNREACHABLE)
+    value = grids.cost_to_go(cost, initial, resolution=size, max_iterations=spec.max_iterations)
+    nearby = jnp.where(to_robot < 2.0 * size, value, grids.UNREACHABLE)
+    return Route(value=_spread(value, by), reachable=jnp.min(nearby) < 0.5 * grids.UNREACHABLE)
+
+
+def straight(
+    shape: tuple[int, int], origin: Float[Array, "2"], resolution: float, goal: Float[Array, "2"]
+) -> Float[Array, "H W"]:
+    """The paper's progress: straight distance [m] from every cell to the goal."""
+    x, y = geometry.cell_centres(shape, origin, resolution)
+    return jnp.hypot(x - goal[0], y - goal[1])

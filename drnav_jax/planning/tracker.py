@@ -1,0 +1,173 @@
+"""DWA: the velocity that brings the robot to g* soonest, among those from which it can still stop (Fox et al. 1997).
+
+Candidates are the speeds reachable within one tick. Each is certified first: drive it for one tick, then brake both
+speeds at their limits; at every sample of that motion the footprint must stay clear (or, if it stands closer than the
+margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
+certified command in a static world; if the map changed its mind, the answer is to brake.
+
+Certified candidates are then rolled out over `sim_time` and ranked by the time still needed from the last free pose,
+
+    J = |g - p| / v_max + w_h |bearing error| / w_max + w_c mean((soft - d)/soft)_+^2 + w_s |omega - omega_0| / w_max
+
+which turns on the spot when the goal is behind, drives arcs when it is not, and needs no case distinction.
+"""
+
+import dataclasses
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from drnav_jax import geometry
+from drnav_jax.planning import dynamics
+from drnav_jax.planning.dynamics import Motion
+from drnav_jax.types import Command, GridMap, RobotParams, Scalar
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackerSpec:
+    """Samples of the dynamic window.
+
+    Attributes:
+        num_speeds: Levels of v.
+        num_turns: Levels of omega.
+        dt: Tick [s].
+        num_steps: Steps of the ranking rollout, each `dt`.
+        brake_ticks: Ticks within which every certified motion must have stopped.
+        samples: Footprint checks per tick of the certificate.
+    """
+
+    num_speeds: int = 11
+    num_turns: int = 21
+    dt: float = 0.1
+    num_steps: int = 12
+    brake_ticks: int = 10
+    samples: int = 2
+
+    def __post_init__(self) -> None:
+        """Check counts."""
+        if min(self.num_speeds, self.num_turns, self.num_steps, self.brake_ticks, self.samples) < 1 or self.dt <= 0:
+            raise ValueError(f"all counts must be >= 1 and dt > 0 s, got {self}.")
+
+
+class TrackerParams(NamedTuple):
+    """Weights of the ranking; times in seconds."""
+
+    margin: Scalar = 0.03  # [] beyond the radius: no certified motion comes closer [m]
+    heading: Scalar = 1.0  # [] w_h
+    clearance: Scalar = 0.5  # [] w_c [s]
+    soft_clearance: Scalar = 0.3  # [] beyond the radius: where the clearance term begins [m]
+    smoothness: Scalar = 0.05  # [] w_s [s]
+
+
+class Track(NamedTuple):
+    """The chosen command and what it rests on."""
+
+    command: Command
+    certified: Bool[Array, ""]  # False: nothing could be certified, the command brakes
+    cost: Float[Array, ""]  # J of the choice [s]
+    clearance: Float[Array, ""]  # least clearance of the certified motion [m]
+
+
+def _grid(num: int, low: Array, high: Array) -> Array:
+    """`num` levels from low to high; the middle one is replaced by the level nearest to standing still."""
+    levels = low + (high - low) * jnp.linspace(0.0, 1.0, num, dtype=jnp.float32)
+    return levels.at[num // 2].set(jnp.clip(0.0, low, high))
+
+
+@partial(jax.jit, static_argnames="spec")
+def track(
+    spec: TrackerSpec,
+    params: TrackerParams,
+    robot: RobotParams,
+    clear: GridMap,
+    pose: Float[Array, "3"],
+    twist: Float[Array, "2"],
+    target: Float[Array, "2"],
+    seek_room: Bool[Array, ""],
+) -> Track:
+    """The best certified command towards `target`.
+
+    Args:
+        spec: Samples.
+        params: Weights.
+        robot: Radius and limits.
+        clear: Clearance [m] of map cells in odom.
+        pose: Robot in odom.
+        twist: Its speeds (v, omega).
+        target: g* in odom [m].
+        seek_room: Rank by clearance instead: gets a robot out of a squeeze.
+    """
+    dt = spec.dt
+    v0, w0 = twist[0], twist[1]
+    # never beyond what the robot can still do about its speed, even if it is over a limit now
+    v_low, v_high = v0 - robot.a_max * dt, v0 + robot.a_max * dt
+    w_low, w_high = w0 - robot.alpha_max * dt, w0 + robot.alpha_max * dt
+    v_low, v_high = (jnp.clip(a, robot.v_min, robot.v_max) for a in (v_low, v_high))
+    w_low, w_high = (jnp.clip(a, -robot.w_max, robot.w_max) for a in (w_low, w_high))
+    v = _grid(spec.num_speeds, v_low, v_high)
+    w = _grid(spec.num_turns, w_low, w_high)
+    v, w = jnp.repeat(v, spec.num_turns), jnp.tile(w, spec.num_speeds)
+    stop = dynamics.limit(0.0, 0.0, twist, robot, dt)
+    v, w = jnp.concatenate([v, stop.v[None]]), jnp.concatenate([w, stop.omega[None]])
+
+    def room(m: Motion) -> Array:
+        return geometry.sample_bilinear(clear, jnp.stack([m.x, m.y], axis=-1))
+
+    def drive(m: Motion) -> tuple[Motion, Array]:
+        """One tick at the speeds of `m`; least clearance on the way."""
+        least = None
+        for _ in range(spec.samples):
+            m = dynamics.advance(m, m.v, m.w, robot, dt / spec.samples)
+            here = room(m)
+            least = here if least is None else jnp.minimum(least, here)
+        return m, least
+
+    start = dynamics.start(pose, twist, v.shape[0])._replace(v=v, w=w)
+    here = room(start)[0]
+
+    def brake(carry: tuple[Motion, Array], _: None) -> tuple[tuple[Motion, Array], None]:
+        m, least = carry
+        m = m._replace(
+            v=dynamics.approach(m.v, jnp.zeros_like(v), robot.a_max * dt),
+            w=dynamics.approach(m.w, jnp.zeros_like(w), robot.alpha_max * dt),
+        )
+        m, near = drive(m)
+        return (m, jnp.minimum(least, near)), None
+
+    (end, least), _ = jax.lax.scan(brake, drive(start), None, length=spec.brake_ticks)
+    block = jnp.minimum(robot.radius + params.margin, here - 0.002)
+    still = (v == 0) & (w == 0)
+    certified = ((least >= block) & (jnp.abs(end.v) < 1e-3)) | still
+
+    soft = robot.radius + params.soft_clearance
+
+    def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
+        m, lack, free = carry
+        ahead = dynamics.advance(m, v, w, robot, dt)
+        near = room(ahead)
+        free = free & (near >= block)
+        m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
+        return (m, lack + jnp.square(jnp.clip((soft - near) / soft, 0.0, 1.0)), free), None
+
+    carry = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
+    (last, lack, _), _ = jax.lax.scan(roll, carry, None, length=spec.num_steps)
+    dx, dy = target[0] - last.x, target[1] - last.y
+    distance = jnp.hypot(dx, dy)
+    bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))
+    cost = (
+        distance / robot.v_max
+        + params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0)
+        + params.clearance * lack / spec.num_steps
+        + params.smoothness * jnp.abs(w - w0) / robot.w_max
+    )
+    cost = jnp.where(seek_room, -room(last), cost)
+    cost = jnp.where(certified, cost, jnp.inf)
+    k = jnp.argmin(cost)
+    any_certified = jnp.any(certified)
+    command = dynamics.limit(
+        jnp.where(any_certified, v[k], 0.0), jnp.where(any_certified, w[k], 0.0), twist, robot, dt
+    )
+    return Track(command=command, certified=any_certified, cost=cost[k], clearance=least[k])

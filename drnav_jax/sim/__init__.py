@@ -1,0 +1,16 @@
+"""A simulator over `worlds`: sensors, contact and motion of one robot; the caller vmaps."""
+
+from drnav_jax.sim.contact import clearance
+from drnav_jax.sim.kinematic import FaultParams, odometry, step
+from drnav_jax.sim.lidar import LidarParams, LidarSpec, cast, scan
+
+__all__ = [
+    "FaultParams",
+    "LidarParams",
+    "LidarSpec",
+    "cast",
+    "clearance",
+    "odometry",
+    "scan",
+    "step",
+]

@@ -1,0 +1,280 @@
+"""Closed-loop episodes: world -> sensors -> policy -> physics, batched, in compiled chunks.
+
+An episode is an outer scan over replans and an inner scan over ticks (so `replan` is static), `chunk_ticks` ticks at a
+time. A host loop calls chunks until every episode is over and keeps what is finished. Episodes of a batch are worked on
+`lanes` at a time (vmapped), one group after another: on a CPU small groups stay in the cache and finished ones are
+skipped; on an accelerator one wide group is best. The policy comes as functions: nothing here knows a planner.
+"""
+
+import dataclasses
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PRNGKeyArray
+
+from drnav_jax.sim import contact, kinematic, lidar
+from drnav_jax.sim.kinematic import FaultParams
+from drnav_jax.sim.lidar import LidarParams, LidarSpec
+from drnav_jax.types import Command, Observation, RobotParams, Scalar, empty_observation
+from drnav_jax.worlds.world import World
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """The robot's mind as two functions.
+
+    Attributes:
+        init: `(params, pose) -> state`.
+        step: `(params, state, observation, key, replan) -> (state, Command, log)`; `replan` is a Python bool, `log` a
+            pytree of small arrays that is recorded every tick.
+    """
+
+    init: Callable[[Any, Array], Any]
+    step: Callable[[Any, Any, Observation, PRNGKeyArray, bool], tuple[Any, Command, Any]]
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodeSpec:
+    """Sizes of the simulation.
+
+    Attributes:
+        lidar: The beams.
+        dt: Tick [s].
+        replan_every: Ticks per replan.
+        chunk_ticks: Ticks per compiled call; a multiple of `replan_every`.
+        lanes: Episodes vmapped together.
+    """
+
+    lidar: LidarSpec = LidarSpec()
+    dt: float = 0.1
+    replan_every: int = 5
+    chunk_ticks: int = 50
+    lanes: int = 1
+
+    def __post_init__(self) -> None:
+        """Check sizes."""
+        if self.dt <= 0:
+            raise ValueError(f"dt must be > 0 s, got {self.dt}.")
+        if self.replan_every < 1 or self.chunk_ticks % self.replan_every:
+            raise ValueError(
+                f"chunk_ticks must be a multiple of replan_every >= 1, got {self.chunk_ticks} and {self.replan_every}."
+            )
+        if self.lanes < 1:
+            raise ValueError(f"lanes must be >= 1, got {self.lanes}.")
+
+
+class EpisodeParams(NamedTuple):
+    """What may differ from episode to episode; batched along axis 0."""
+
+    world: World
+    start: Array  # [3] x, y, yaw
+    goal: Array  # [2] [m]
+    time_limit: Array  # [] [s]
+    goal_tolerance: Array  # [] [m]
+    robot: RobotParams  # the true robot
+    policy: Any  # the policy's parameters
+    lidar: LidarParams = LidarParams()
+    faults: FaultParams = FaultParams()
+
+
+class EpisodeState(NamedTuple):
+    """One episode under way."""
+
+    pose: Array  # [3] true pose in the world
+    odometry: Array  # [3] pose as the robot believes it
+    twist: Array  # [2]
+    policy: Any
+    key: Array
+    tick: Array  # [] int32
+    active: Array  # [] bool
+    success: Array  # [] bool
+    collision: Array  # [] bool
+    distance: Array  # [] driven [m]
+    retreat: Array  # [] driven away from the goal [m]
+    min_clearance: Array  # [] true clearance of the footprint, least so far [m]
+
+
+class Log(NamedTuple):
+    """One tick as recorded; `[T]` in front."""
+
+    pose: Array  # [3] after the tick
+    command: Array  # [2]
+    active: Array  # [] bool, the episode was under way
+    policy: Any  # the policy's own log
+
+
+def start(policy: Policy, params: EpisodeParams, key: PRNGKeyArray) -> EpisodeState:
+    """The episode before its first tick (one episode; the caller vmaps)."""
+    zero = jnp.zeros((), jnp.float32)
+    pose = jnp.asarray(params.start, jnp.float32)
+    return EpisodeState(
+        pose=pose, odometry=pose, twist=jnp.zeros(2, jnp.float32), policy=policy.init(params.policy, pose), key=key,
+        tick=jnp.zeros((), jnp.int32), active=jnp.asarray(True), success=jnp.asarray(False),
+        collision=jnp.asarray(False), distance=zero, retreat=zero, min_clearance=jnp.asarray(jnp.inf, jnp.float32),
+    )  # fmt: skip
+
+
+def tick(
+    spec: EpisodeSpec, policy: Policy, params: EpisodeParams, state: EpisodeState, replan: bool
+) -> tuple[EpisodeState, Log]:
+    """Sense, decide, move, judge: once. A finished episode stays as it is."""
+    key_scan, key_policy = jax.random.split(jax.random.fold_in(state.key, state.tick))
+    points, valid = lidar.scan(spec.lidar, params.lidar, params.world, state.pose, key_scan)
+    observation = empty_observation(points.shape[0])._replace(
+        points=points, point_valid=valid, pose=state.odometry, twist=state.twist, goal=params.goal
+    )
+    mind, command, log = policy.step(params.policy, state.policy, observation, key_policy, replan)
+    pose, twist = kinematic.step(params.robot, state.pose, state.twist, command, spec.dt, params.faults)
+    odometry = kinematic.odometry(state.odometry, state.pose, pose, params.faults)
+    middle = 0.5 * (state.pose[:2] + pose[:2])
+    room = jnp.minimum(contact.clearance(params.world, pose[:2]), contact.clearance(params.world, middle))
+    room = room - params.robot.radius
+    hit = room < 0
+    to_goal = jnp.hypot(pose[0] - params.goal[0], pose[1] - params.goal[1])
+    from_goal = jnp.hypot(state.pose[0] - params.goal[0], state.pose[1] - params.goal[1])
+    moved = jnp.hypot(pose[0] - state.pose[0], pose[1] - state.pose[1])
+    arrived = (to_goal <= params.goal_tolerance) & ~hit
+    late = (state.tick + 1) * spec.dt >= params.time_limit
+    going = state.active
+    new = EpisodeState(
+        pose=pose, odometry=odometry, twist=twist, policy=mind, key=state.key, tick=state.tick + 1,
+        active=~(hit | arrived | late), success=arrived, collision=hit, distance=state.distance + moved,
+        retreat=state.retreat + jnp.maximum(to_goal - from_goal, 0.0),
+        min_clearance=jnp.minimum(state.min_clearance, room),
+    )  # fmt: skip
+    keep = {name: getattr(state, name) for name in EpisodeState._fields if name not in ("policy", "key")}
+    held = jax.tree.map(lambda a, b: jnp.where(going, a, b), {n: getattr(new, n) for n in keep}, keep)
+    record = Log(
+        pose=held["pose"], command=jnp.stack([command.v, command.omega]), active=going, policy=log
+    )
+    return new._replace(**held), record
+
+
+def chunk(
+    spec: EpisodeSpec, policy: Policy, params: EpisodeParams, state: EpisodeState
+) -> tuple[EpisodeState, Log]:
+    """`chunk_ticks` ticks of one episode; the log has `[chunk_ticks]` in front."""
+
+    def period(state: EpisodeState, _: None) -> tuple[EpisodeState, Log]:
+        state, first = tick(spec, policy, params, state, True)
+        if spec.replan_every == 1:
+            return state, jax.tree.map(lambda a: a[None], first)
+        plain = lambda s, _: tick(spec, policy, params, s, False)  # noqa: E731
+        state, rest = jax.lax.scan(plain, state, None, length=spec.replan_every - 1)
+        return state, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+
+    state, log = jax.lax.scan(period, state, None, length=spec.chunk_ticks // spec.replan_every)
+    return state, jax.tree.map(lambda a: a.reshape(spec.chunk_ticks, *a.shape[2:]), log)
+
+
+@partial(jax.jit, static_argnames=("spec", "policy"))
+def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: PRNGKeyArray) -> EpisodeState:
+    return jax.lax.map(lambda a: start(policy, *a), (params, keys), batch_size=spec.lanes)
+
+
+@partial(jax.jit, static_argnames=("spec", "policy"), donate_argnames="state")
+def _chunk_batch(
+    spec: EpisodeSpec, policy: Policy, params: EpisodeParams, state: EpisodeState
+) -> tuple[EpisodeState, Log]:
+    """One chunk of every episode of the batch; groups that are over are skipped."""
+    one = lambda p, s: chunk(spec, policy, p, s)  # noqa: E731
+    empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(one, *_first((params, state)))[1])
+
+    def group(args: tuple[EpisodeParams, EpisodeState]) -> tuple[EpisodeState, Log]:
+        return jax.lax.cond(args[1].active, one, lambda p, s: (s, empty), *args)
+
+    return jax.lax.map(group, (params, state), batch_size=spec.lanes if spec.lanes > 1 else None)
+
+
+def _first(tree: Any) -> Any:
+    return jax.tree.map(lambda a: a[0], tree)
+
+
+class Result(NamedTuple):
+    """Episodes as far as they got; numpy, `[B]` in front."""
+
+    state: EpisodeState  # without the policy's state
+    log: Log  # [B, T]; only ticks where `active` count
+    finished: np.ndarray  # [B] bool; False where the run was interrupted
+
+
+def run(
+    spec: EpisodeSpec,
+    policy: Policy,
+    params: EpisodeParams,
+    keys: PRNGKeyArray,
+    *,
+    workers: int = 2,
+    progress: Callable[[int], None] | None = None,
+) -> Result:
+    """Run a batch of episodes to their ends.
+
+    Args:
+        spec: Sizes.
+        policy: The robot's mind.
+        params: Worlds, trips and parameters, `[B, ...]` leaves.
+        keys: One key per episode, `[B]`.
+        workers: Threads that share the batch; results do not depend on it.
+        progress: Called with the number of finished episodes after every chunk.
+
+    Returns:
+        Results of all episodes. After a KeyboardInterrupt: as far as they got, `finished` False for the rest.
+    """
+    count = keys.shape[0]
+    shards = [np.arange(k, count, workers) for k in range(min(workers, count))]
+    done, stop = [0] * len(shards), threading.Event()
+
+    def work(which: int) -> tuple[EpisodeState, Log]:
+        index = shards[which]
+        mine = jax.tree.map(lambda a: jnp.asarray(a)[index], (params, keys))
+        state = _start_batch(spec, policy, *mine)
+        logs = []
+        while bool(jnp.any(state.active)) and not stop.is_set():
+            state, log = _chunk_batch(spec, policy, mine[0], state)
+            logs.append(jax.device_get(log))
+            done[which] = int(np.sum(~np.asarray(state.active)))
+            if progress is not None:
+                progress(sum(done))
+        state = state._replace(policy=None, key=jax.random.key_data(state.key))
+        return jax.device_get(state), jax.tree.map(lambda *a: np.concatenate(a, axis=1), *logs)
+
+    with ThreadPoolExecutor(len(shards)) as pool:
+        futures = [pool.submit(work, k) for k in range(len(shards))]
+        try:
+            while not all(f.done() for f in futures):
+                threading.Event().wait(0.05)
+        except KeyboardInterrupt:
+            stop.set()
+        parts = [f.result() for f in futures]
+    return _join(parts, shards)
+
+
+def _join(parts: list[tuple[EpisodeState, Log]], shards: list[np.ndarray]) -> Result:
+    """Put the shards' episodes back in order; logs are padded to the longest."""
+    order = np.argsort(np.concatenate(shards))
+    longest = max(log.active.shape[1] for _, log in parts)
+
+    def pad(a: np.ndarray) -> np.ndarray:
+        return np.pad(a, [(0, 0), (0, longest - a.shape[1])] + [(0, 0)] * (a.ndim - 2))
+
+    state = jax.tree.map(lambda *a: np.concatenate(a)[order], *[s for s, _ in parts])
+    log = jax.tree.map(lambda *a: np.concatenate([pad(x) for x in a])[order], *[log for _, log in parts])
+    return Result(state=state, log=log, finished=~state.active)
+
+
+def replay(
+    spec: EpisodeSpec, policy: Policy, params: EpisodeParams, key: PRNGKeyArray
+) -> Iterator[EpisodeState]:
+    """One episode again, chunk by chunk, with the policy's whole state: for pictures of what it believed."""
+    single = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, key))
+    state = _start_batch(spec, policy, *single)
+    yield _first(state)
+    while bool(state.active[0]):
+        state, _ = _chunk_batch(spec, policy, single[0], state)
+        yield _first(jax.tree.map(jnp.copy, state))

@@ -1,0 +1,48 @@
+"""Worlds to drive in: geometry, ground truth, loaders and seeded families."""
+
+from drnav_jax.worlds.barn import load_barn
+from drnav_jax.worlds.families import FAMILIES, SPLITS, sample, twin
+from drnav_jax.worlds.maps import load_floor_plan, load_map_server, load_occupancy
+from drnav_jax.worlds.moving_ai import ScenarioTrip, load_moving_ai, load_scenario, with_scenario
+from drnav_jax.worlds.trips import check_trip, sample_trips, shortest_path, trip_cells
+from drnav_jax.worlds.world import (
+    FAR,
+    WALL_HEIGHT,
+    Scene,
+    World,
+    distance_field,
+    from_grid,
+    no_field,
+    rasterise,
+    signed_distance,
+    stack_worlds,
+)
+
+__all__ = [
+    "FAMILIES",
+    "FAR",
+    "SPLITS",
+    "WALL_HEIGHT",
+    "Scene",
+    "ScenarioTrip",
+    "World",
+    "check_trip",
+    "distance_field",
+    "from_grid",
+    "load_barn",
+    "load_floor_plan",
+    "load_map_server",
+    "load_moving_ai",
+    "load_occupancy",
+    "load_scenario",
+    "no_field",
+    "rasterise",
+    "sample",
+    "sample_trips",
+    "shortest_path",
+    "signed_distance",
+    "stack_worlds",
+    "trip_cells",
+    "twin",
+    "with_scenario",
+]

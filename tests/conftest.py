@@ -1,0 +1,55 @@
+"""What holds for every test: the device, the compile cache, shape checks and strict promotion."""
+
+import contextlib
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Before the first import of jax, which reads it once.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+import jaxtyping  # noqa: E402
+import pytest  # noqa: E402
+
+# Every program is cached, however small: the suite compiles many and runs each for milliseconds.
+jax.config.update("jax_compilation_cache_dir", str(ROOT / ".jax_cache"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+# Shapes in signatures are checked at each call. Holds for modules imported from here on, so no
+# module of the package may be imported above this line. NamedTuples pass through vmap, scan and
+# tree.map unchecked; a dataclass that is a pytree with jaxtyping fields would be checked when it
+# is rebuilt there, and fail.
+jaxtyping.install_import_hook("drnav_jax", "beartype.beartype")
+
+# The first example compiles, so a deadline says nothing; derandomized, because the same commit
+# shall give the same result.
+hypothesis.settings.register_profile("drnav", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("drnav")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Runs a test's body without implicit dtype or rank promotion, unless it is marked `relaxed`.
+
+    Fixtures stay outside: one that both kinds share must not depend on which test came first.
+    """
+    with contextlib.ExitStack() as stack:
+        if item.get_closest_marker("relaxed") is None:
+            stack.enter_context(jax.numpy_dtype_promotion("strict"))
+            stack.enter_context(jax.numpy_rank_promotion("raise"))
+        return (yield)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recordings, maps and scans; the test is skipped where there is none."""
+    named = os.environ.get("DRNAV_DATA")
+    folder = Path(named).expanduser() if named else ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        where = f"DRNAV_DATA={named}" if named else "../shared/data beside the checkout"
+        pytest.skip(f"needs real input data: {where} is not there; set DRNAV_DATA to its folder.")
+    return folder
