@@ -83,7 +83,7 @@ def sample_bilinear(grid: GridMap, xy: Float[Array, "*s 2"], fill: Scalar | None
     fx = jnp.clip((xy[..., 0] - grid.origin[0]) / grid.resolution - 0.5, 0.0, w - 1.0)
     fy = jnp.clip((xy[..., 1] - grid.origin[1]) / grid.resolution - 0.5, 0.0, h - 1.0)
     col, row = jnp.minimum(fx.astype(jnp.int32), w - 2), jnp.minimum(fy.astype(jnp.int32), h - 2)
-    ax, ay = fx - col, fy - row
+    ax, ay = fx - col.astype(fx.dtype), fy - row.astype(fy.dtype)
     flat, k = grid.values.reshape(-1), row * w + col
     v00, v01, v10, v11 = (flat.at[k + o].get(mode="promise_in_bounds") for o in (0, 1, w, w + 1))
     value = (v00 * (1 - ax) + v01 * ax) * (1 - ay) + (v10 * (1 - ax) + v11 * ax) * ay

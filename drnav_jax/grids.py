@@ -6,11 +6,12 @@ They know cells only; `geometry` knows where cells lie. Distances are in metres 
   (Felzenszwalb & Huttenlocher 2012): D(i, j) = min_a [a^2 + min_b (b^2 : mask(i + a, j + b))], both minima over |.| <= n.
 - `flood_fill`: 4-connected fill on 32 cells per machine word.
 - `cost_to_go`: min-plus Jacobi iteration V <- min(V, min_k V(c + k) + |k| cost(c)) over 16 neighbours (queen and knight
-  moves: the metric is at most 2.7 % longer than Euclid's) until nothing changes; equals Dijkstra on that graph.
+  moves: in the open the metric is at most 2.7 % longer than Euclid's) until nothing changes; equals Dijkstra on that
+  graph.
 - `descend`: the path that follows V downhill.
 """
 
-from functools import partial
+from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
@@ -91,30 +92,65 @@ def flood_fill(passable: Bool[Array, "H W"], seeds: Bool[Array, "H W"]) -> Bool[
     return _unpack(filled, passable.shape[1])
 
 
+def _everywhere(mask: Bool[Array, "H W"], reach: int) -> Bool[Array, "H W"]:
+    """Whether the mask holds on all cells within `reach` (Chebyshev); beyond the edge it does."""
+    h, w = mask.shape
+    n = 2 * reach + 1
+    padded = jnp.pad(mask, reach, constant_values=True)
+    rows = padded[:, :w]
+    for k in range(1, n):
+        rows = rows & padded[:, k : k + w]
+    out = rows[:h]
+    for k in range(1, n):
+        out = out & rows[k : k + h]
+    return out
+
+
 @partial(jax.jit, static_argnames=("max_iterations",))
 def cost_to_go(
-    cell_cost: Float[Array, "H W"], initial: Float[Array, "H W"], *, resolution: Scalar, max_iterations: int = 2000
+    cell_cost: Float[Array, "H W"],
+    initial: Float[Array, "H W"],
+    *,
+    resolution: Scalar,
+    east: Bool[Array, "H W"] | None = None,
+    north: Bool[Array, "H W"] | None = None,
+    max_iterations: int = 2000,
 ) -> Float[Array, "H W"]:
     """Least cost from every cell to the goal cells; `UNREACHABLE` where there is no way.
 
+    Moves: straight ones through open sides; diagonal ones from cells whose 8 neighbours, knight moves from cells whose
+    24 neighbours can all be entered through open sides. So nothing is squeezed through a corner or jumped over.
+
     Args:
-        cell_cost: Cost per metre of moving into each cell, >= 0 (1 = plain distance), `UNREACHABLE` where one cannot go.
+        cell_cost: Cost per metre of leaving each cell, >= 0 (1 = plain distance), `UNREACHABLE` where one cannot be.
         initial: Value of the goal cells (0, or what lies beyond them) [m], `UNREACHABLE` elsewhere.
         resolution: Edge of a cell [m].
+        east: Whether one can pass between (i, j) and (i, j + 1); None = wherever both cells can be entered.
+        north: Whether one can pass between (i, j) and (i + 1, j); None = likewise.
         max_iterations: Bound on the sweeps; the iteration stops by itself when nothing changes.
     """
     h, w = cell_cost.shape
+    enter = cell_cost < UNREACHABLE
+    ahead = jnp.pad(enter, ((0, 1), (0, 1)))
+    east = (enter & ahead[:h, 1:]) if east is None else (east & enter & ahead[:h, 1:])
+    north = (enter & ahead[1:, :w]) if north is None else (north & enter & ahead[1:, :w])
+    # at the window's edge there is no side to be open: it does not make a cell narrow
+    sides = enter & (east | (jnp.arange(w) == w - 1)[None, :]) & (north | (jnp.arange(h) == h - 1)[:, None])
+    roomy = _everywhere(sides, 1)
     step = jnp.minimum(cell_cost * resolution, UNREACHABLE)
+    gate = lambda allowed, length: jnp.where(allowed, length * step, UNREACHABLE)  # noqa: E731
+    west, south = jnp.pad(east, ((0, 0), (1, 0)))[:, :w], jnp.pad(north, ((1, 0), (0, 0)))[:h]
+    costs = [gate(a, 1.0) for a in (east, west, north, south)]
+    diagonal, knight = gate(roomy, 2**0.5), gate(_everywhere(sides, 2), 5**0.5)
 
     def relax(value: Array) -> Array:
         padded = jnp.pad(value, 2, constant_values=UNREACHABLE)
+        look = lambda move: padded[2 + move[0] : 2 + move[0] + h, 2 + move[1] : 2 + move[1] + w]  # noqa: E731
         best = value
-        for moves, length in _MOVES:
-            near = None
-            for i, j in moves:
-                other = padded[2 + i : 2 + i + h, 2 + j : 2 + j + w]
-                near = other if near is None else jnp.minimum(near, other)
-            best = jnp.minimum(best, near + length * step)
+        for move, cost in zip(_STRAIGHT, costs, strict=True):
+            best = jnp.minimum(best, look(move) + cost)
+        for moves, cost in ((_DIAGONAL, diagonal), (_KNIGHT, knight)):
+            best = jnp.minimum(best, reduce(jnp.minimum, map(look, moves)) + cost)
         return best
 
     def sweep(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -127,8 +163,8 @@ def cost_to_go(
     def unfinished(carry: tuple[Array, Array, Array]) -> Array:
         return carry[1] & (carry[2] < max_iterations)
 
-    start = (initial, jnp.asarray(True), jnp.asarray(0, jnp.int32))
-    return jnp.minimum(jax.lax.while_loop(unfinished, sweep, start)[0], UNREACHABLE)
+    begin = (jnp.minimum(initial, UNREACHABLE), jnp.asarray(True), jnp.asarray(0, jnp.int32))
+    return jnp.minimum(jax.lax.while_loop(unfinished, sweep, begin)[0], UNREACHABLE)
 
 
 @partial(jax.jit, static_argnames=("num_steps",))

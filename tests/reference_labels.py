@@ -1,5 +1,6 @@
 """Dead-end labels by brute force: every gate of the medial axis, every component grown anew."""
 
+import collections
 import heapq
 
 import numpy as np
@@ -15,8 +16,9 @@ def clearance(occupied: np.ndarray, resolution: float) -> np.ndarray:
     return np.sqrt(squares) * resolution - 0.5 * resolution
 
 
-def dead_ends(occupied, resolution, radius, mouth, depth_ratio, max_share, path=None):
-    """Label and width of the narrowest gate for each cell, by the definition's own words."""
+def dead_ends(occupied, resolution, spec, path=None):
+    """Label and gap of the narrowest gate of each cell, by the definition's own words."""
+    radius, mouth = spec.radius, spec.mouth
     pad = int(np.ceil((mouth / 2 + radius) / resolution)) + 3
     d = clearance(np.pad(occupied, pad), resolution)
     free = d > radius
@@ -44,14 +46,14 @@ def dead_ends(occupied, resolution, radius, mouth, depth_ratio, max_share, path=
             whole = parts == parts[piece][0]
             closed = not anchor[whole].any()
             share = piece.sum() / whole.sum()
-            if anchor[piece].any() or share > max_share or (closed and share > 0.5):
+            if anchor[piece].any() or share > spec.max_share or (closed and share > 0.5):
                 continue
             way = np.hypot(rows[piece] - i, columns[piece] - j).max() * resolution - reach[i, j]
-            if way >= max(2 * radius + 0.5, depth_ratio * width):
+            if way >= max(2 * radius + 0.5, spec.depth_ratio * width):
                 label |= piece
                 gap[piece] = np.minimum(gap[piece], width)
     inner = (slice(pad, -pad), slice(pad, -pad))
-    return label[inner], gap[inner], free[inner]
+    return label[inner], gap[inner]
 
 
 def way_out(label, free):
@@ -77,3 +79,25 @@ def way_out(label, free):
                         way[a, b] = longer
                         heapq.heappush(queue, (longer, a, b))
     return np.where(label, way, 0.0)[1:-1, 1:-1]
+
+
+def any_path(free, rng):
+    """Cells of a shortest 4-connected way between two random cells, or None where there is none."""
+    cells = [tuple(c) for c in np.argwhere(free).tolist()]
+    if not cells:
+        return None
+    start, goal = (cells[k] for k in rng.integers(len(cells), size=2))
+    before, queue = {start: None}, collections.deque([start])
+    while queue:
+        i, j = queue.popleft()
+        for near in ((i, j + 1), (i + 1, j), (i, j - 1), (i - 1, j)):
+            inside = 0 <= near[0] < free.shape[0] and 0 <= near[1] < free.shape[1]
+            if inside and free[near] and near not in before:
+                before[near] = (i, j)
+                queue.append(near)
+    if goal not in before:
+        return None
+    path = [goal]
+    while before[path[-1]] is not None:
+        path.append(before[path[-1]])
+    return np.array(path[::-1])

@@ -48,8 +48,11 @@ def inflation(distance: Float[Array, "*s"], inscribed: Scalar, params: Inflation
 
 @partial(jax.jit, static_argnames="resolution")
 def clearance(occupied: Bool[Array, "H W"], resolution: float) -> Float[Array, "H W"]:
-    """Distance [m] from cell centres to the near edge of the nearest occupied cell, at most `MAX_CLEARANCE`."""
-    return grids.distance_transform(occupied, resolution, MAX_CLEARANCE) - 0.5 * resolution
+    """Distance [m] between the centres of each cell and of the nearest occupied one, at most `MAX_CLEARANCE`.
+
+    The surface itself lies anywhere within that cell: up to 0.7 of a cell nearer. Margins allow for it.
+    """
+    return grids.distance_transform(occupied, resolution, MAX_CLEARANCE)
 
 
 @jax.jit

@@ -44,14 +44,15 @@ class RouteSpec:
 class RouteParams(NamedTuple):
     """What the route costs."""
 
-    margin: Scalar = 0.1  # [] beyond the radius: cells with less clearance are closed [m]
+    margin: Scalar = 0.1  # [] beyond the radius: cells with less clearance cost `tight_cost` [m]
+    closed_margin: Scalar = 0.035  # [] beyond the radius: cells with less clearance are closed [m]
+    tight_cost: Scalar = 5.0  # [] per metre, where it is tight
     inflation_weight: Scalar = 0.5  # [] w_i
     inflation: InflationParams = InflationParams(scaling=4.0, radius=1.0)
     risk_weight: Scalar = 3.0  # [] lambda inside the cell cost
     risk_cap: Scalar = 4.0  # [] most that risk adds to a metre
     visit_weight: Scalar = 4.0  # [] w_v
-    escape_radius: Scalar = 0.6  # [] a robot that stands too close may pass closed free cells this near [m]
-    escape_cost: Scalar = 5.0  # [] per metre, through those
+    escape_radius: Scalar = 0.6  # [] a robot that stands too close may pass closed cells this near [m]
     lost_penalty: Scalar = 100.0  # [] added to leaving the window when the goal is inside it [m]
 
 
@@ -65,6 +66,19 @@ class Route(NamedTuple):
 def _pool(values: Array, by: int, reduce: str) -> Array:
     h, w = values.shape
     return getattr(jnp, reduce)(values.reshape(h // by, by, w // by, by), axis=(1, 3))
+
+
+def _sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
+    """Through which east and north sides of the coarse cells one gets from free map cell to free map cell.
+
+    A coarse cell is open if any of its map cells is, so that narrow ways stay; but without this test it would also
+    join cells between which there is no way.
+    """
+    h, w = free.shape
+    ahead = jnp.pad(free, ((0, 1), (0, 1)))
+    across = (free & ahead[:h, 1:])[:, by - 1 :: by].reshape(h // by, by, w // by)
+    along = (free & ahead[1:, :w])[by - 1 :: by].reshape(h // by, w // by, by)
+    return jnp.any(across, axis=1), jnp.any(along, axis=2)
 
 
 def _spread(value: Array, by: int) -> Array:
@@ -114,11 +128,17 @@ def solve(
         robot: Its radius.
     """
     by, size = spec.pooling, resolution * spec.pooling
+    inscribed = robot.radius + params.margin
+    x, y = geometry.cell_centres(clear.shape, origin, resolution)
+    near = jnp.hypot(x - xy[0], y - xy[1]) < params.escape_radius
+    # closed, unless the robot stands there already or the goal is there
+    at_goal = jnp.hypot(x - goal[0], y - goal[1]) <= 1.5 * size
+    free = (clear >= robot.radius + params.closed_margin) | ((near | at_goal) & (clear > 0.5 * robot.radius))
+    east, north = _sides(free, by)
     clear, risk, visits = _pool(clear, by, "max"), _pool(risk, by, "mean"), _pool(visits, by, "mean")
     h, w = clear.shape
     x, y = geometry.cell_centres((h, w), origin, size)
     to_goal, to_robot = jnp.hypot(x - goal[0], y - goal[1]), jnp.hypot(x - xy[0], y - xy[1])
-    inscribed = robot.radius + params.margin
     soft = jnp.minimum(costmap.inflation(clear, inscribed, params.inflation), 252.0) / 252.0
     cost = (
         1.0
@@ -126,19 +146,17 @@ def solve(
         + jnp.minimum(params.risk_weight * risk, params.risk_cap)
         + params.visit_weight * visits
     )
-    closed = clear < inscribed
-    escape = (to_robot < params.escape_radius) & (clear > 0.5 * robot.radius)
-    cost = jnp.where(closed, jnp.where(escape, params.escape_cost, grids.UNREACHABLE), cost)
-    # a goal that lies nearer to a wall than the planning margin can still be approached
-    at_goal = to_goal <= 1.5 * size
-    cost = jnp.where(at_goal & (clear > 0), jnp.minimum(cost, params.escape_cost), cost)
+    cost = jnp.where(clear < inscribed, params.tight_cost, cost)
+    cost = jnp.where(_pool(free, by, "any"), cost, grids.UNREACHABLE)
     row, col = jnp.arange(h)[:, None], jnp.arange(w)[None, :]
     edge = (row == 0) | (row == h - 1) | (col == 0) | (col == w - 1)
     held = geometry.inside(geometry.cell_of(goal, origin, size), (h, w))
     far = jnp.where(edge, to_goal + jnp.where(held, params.lost_penalty, 0.0), grids.UNREACHABLE)
-    initial = jnp.where(held & at_goal, to_goal, far)
+    initial = jnp.where(held & (to_goal <= 1.5 * size), to_goal, far)
     initial = jnp.where(cost < grids.UNREACHABLE, initial, grids.UNREACHABLE)
-    value = grids.cost_to_go(cost, initial, resolution=size, max_iterations=spec.max_iterations)
+    value = grids.cost_to_go(
+        cost, initial, resolution=size, east=east, north=north, max_iterations=spec.max_iterations
+    )
     nearby = jnp.where(to_robot < 2.0 * size, value, grids.UNREACHABLE)
     return Route(value=_spread(value, by), reachable=jnp.min(nearby) < 0.5 * grids.UNREACHABLE)
 

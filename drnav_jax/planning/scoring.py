@@ -44,9 +44,10 @@ class ScoreParams(NamedTuple):
     risk_weight: Scalar = 3.0  # [] lambda of eq. 1 and 7 [m/m]
     decay: Scalar = 0.1  # [] lambda of w_k = exp(-lambda s_k) [1/m]
     range_min: Scalar = 3.0  # [] endpoints nearer than this pay the range bias [m]
+    least_arc: Scalar = 0.3  # [] a local goal nearer than this is none [m]
     range_max: Scalar = 5.0  # [] endpoints lie no farther than this [m]
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
-    margin: Scalar = 0.06  # [] beyond the radius: closer counts as blocked [m]
+    margin: Scalar = 0.035  # [] beyond the radius: closer counts as blocked [m]
     horizon: Scalar = 4.0  # [] H [s]
 
 

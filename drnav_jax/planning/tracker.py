@@ -138,7 +138,7 @@ def track(
         return (m, jnp.minimum(least, near)), None
 
     (end, least), _ = jax.lax.scan(brake, drive(start), None, length=spec.brake_ticks)
-    block = jnp.minimum(robot.radius + params.margin, here - 0.002)
+    block = jnp.minimum(robot.radius + params.margin, here)
     still = (v == 0) & (w == 0)
     certified = ((least >= block) & (jnp.abs(end.v) < 1e-3)) | still
 

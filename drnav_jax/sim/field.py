@@ -48,7 +48,7 @@ def wall_distance(
         Distances [m]; inf where no wall is met within `reach`.
     """
     h, w = field.values.shape
-    flat, pair = field.values.reshape(-1), jnp.arange(2, dtype=jnp.int32)[:, None]
+    flat = field.values.reshape(-1)
     # From here on in cells; (0, 0) is the centre of cell (0, 0).
     x0, y0 = (origin - field.origin) / field.resolution - 0.5
     dx, dy = (jnp.where(jnp.abs(along) < 1e-9, 1e-9, along) for along in (dx, dy))
@@ -61,39 +61,57 @@ def wall_distance(
     in_wall = (sample_bilinear(field, origin) < 0) & (start <= 0)
     scale = jnp.where(in_wall, -1.0, 1.0) / field.resolution
 
-    def advance(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        t, hit, count = carry
+    def square(t: Array) -> tuple[Array, Array]:
+        """Column and row of the lower left corner of the square that each ray is in at t."""
         x, y = x0 + t * dx, y0 + t * dy
-        # On the line between two squares the ray is in the one that it is about to cross.
+        # On the line between two squares a ray is in the one that it is about to cross.
         left = jnp.where(dx > 0, jnp.floor(x), jnp.ceil(x) - 1)
         low = jnp.where(dy > 0, jnp.floor(y), jnp.ceil(y) - 1)
-        ax, ay = x - left, y - low
-        # One gather, and not four: over a large operand XLA hands each to its thread pool.
-        col = jnp.clip(left.astype(jnp.int32)[None, :] + pair, 0, w - 1)
-        row = jnp.clip(low.astype(jnp.int32)[None, :] + pair, 0, h - 1)
-        cells = (row[:, None, :] * w + col[None, :, :]).reshape(4, -1)
-        v00, v01, v10, v11 = flat.at[cells].get(mode="promise_in_bounds") * scale[None, :]
+        return left, low
 
+    def corners(t: Array) -> Array:
+        """Values `[4, rays]` at the corners of that square."""
+        col, row = (at.astype(jnp.int32) for at in square(t))
+        col0, col1 = jnp.clip(col, 0, w - 1), jnp.clip(col + 1, 0, w - 1)
+        row0, row1 = jnp.clip(row, 0, h - 1) * w, jnp.clip(row + 1, 0, h - 1) * w
+        # One gather, and not four: over a large operand XLA hands each to its thread pool.
+        cells = jnp.stack([row0 + col0, row0 + col1, row1 + col0, row1 + col1])
+        return flat.at[cells].get(mode="promise_in_bounds")
+
+    def under_way(t: Array) -> Array:
+        return (t >= 0) & (t < end)  # a hit at t is noted as -1 - t
+
+    def advance(t: Array, values: Array) -> Array:
+        left, low = square(t)
+        ax, ay = x0 + t * dx - left, y0 + t * dy - low
+        v00, v01, v10, v11 = values * scale[None, :]
         slope_x, slope_y, twist = v01 - v00, v10 - v00, v11 - v10 - v01 + v00
         q0 = v00 + slope_x * ax + slope_y * ay + twist * ax * ay
         q1 = slope_x * dx + slope_y * dy + twist * (ax * dy + ay * dx)
         q2 = twist * dx * dy
-        edge_x = (jnp.where(dx > 0, 1.0, 0.0) - ax) / dx
-        edge_y = (jnp.where(dy > 0, 1.0, 0.0) - ay) / dy
+        edge_x = (jnp.where(dx > 0, 1.0, 0.0) - ax) * inverse_x
+        edge_y = (jnp.where(dy > 0, 1.0, 0.0) - ay) * inverse_y
         edge = jnp.minimum(edge_x, edge_y) + NUDGE
         # The smallest positive root, in the form that stands q2 = 0; negative where there is none.
-        square = q1 * q1 - 4 * q0 * q2
-        root = 2 * q0 / (jnp.sqrt(jnp.maximum(square, 0.0)) - q1)
-        found = (q0 <= 0) | ((square >= 0) & (root >= 0) & (root <= edge))
-        hit = jnp.where(found & (t < end), t + jnp.where(q0 <= 0, 0.0, root), hit)
-        return jnp.where(found, jnp.inf, t + jnp.maximum(edge, q0 - SLACK)), hit, count + 1
+        under_root = q1 * q1 - 4 * q0 * q2
+        root = 2 * q0 / (jnp.sqrt(jnp.maximum(under_root, 0.0)) - q1)
+        root = jnp.where(q0 <= 0, 0.0, jnp.where(under_root < 0, -1.0, root))
+        found = (root >= 0) & (root <= edge)
+        further = jnp.where(found, -1.0 - (t + root), t + jnp.maximum(edge, q0 - SLACK))
+        return jnp.where(under_way(t), further, t)
 
-    def unfinished(carry: tuple[Array, Array, Array]) -> Array:
-        t, _, count = carry
-        return jnp.any(t < end) & (count < limit)
+    def body(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        # Looking up for the next step keeps XLA from fusing the gather into the arithmetic.
+        t, values, count = carry
+        t = advance(t, values)
+        return t, corners(t), count + 1
 
+    inverse_x, inverse_y = 1 / dx, 1 / dy
     limit = 2 * (h + w) + 64  # a ray crosses at most h + w + 2 squares
-    t = jnp.where(start < end, start, jnp.inf)
-    carry = (t, jnp.full_like(dx, jnp.inf), jnp.zeros((), jnp.int32))
-    _, hit, _ = jax.lax.while_loop(unfinished, advance, carry)
-    return jnp.where(hit <= end, hit, jnp.inf) * field.resolution
+    t, _, _ = jax.lax.while_loop(
+        lambda carry: jnp.any(under_way(carry[0])) & (carry[2] < limit),
+        body,
+        (start, corners(start), jnp.zeros((), jnp.int32)),
+    )
+    hit = -1.0 - t
+    return jnp.where((t < 0) & (hit <= end), hit, jnp.inf) * field.resolution

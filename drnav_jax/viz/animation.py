@@ -4,6 +4,7 @@ Arrays are looked up per pixel with NumPy and strokes drawn with Pillow at twice
 frame, with smooth edges. All frames of a GIF share one palette without dithering, so nothing flickers.
 """
 
+import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,6 +14,7 @@ from PIL import Image, ImageDraw
 
 from drnav_jax.types import GridMap
 from drnav_jax.viz import look, marks
+from drnav_jax.viz.look import Number, Numbers
 
 SUFFIXES = (".gif", ".mp4")
 WIDTH, HEADER = 640, 36  # [pixel]
@@ -52,15 +54,15 @@ def belief(
     file: str | Path,
     frames: Sequence[Frame],
     *,
-    goal: tuple[float, float],
-    goal_tolerance: float,
-    radius: float,
-    true_occupied: np.ndarray | None = None,
-    true_origin: tuple[float, float] = (0.0, 0.0),
-    true_resolution: float = 0.1,
-    fps: float = 10.0,
+    goal: Numbers,
+    goal_tolerance: Number,
+    radius: Number,
+    true_occupied: Numbers | None = None,
+    true_origin: Numbers = (0.0, 0.0),
+    true_resolution: Number = 0.1,
+    fps: Number = 10.0,
     max_frames: int = 150,
-    prior: float = look.PRIOR,
+    prior: Number = look.PRIOR,
 ) -> Path:
     """Film the belief of one robot, in a window that holds the whole trip and does not move.
 
@@ -89,15 +91,17 @@ def belief(
         raise ValueError(f'a film is written as {", ".join(SUFFIXES)}, got "{file.name}".')
     if not len(frames):
         raise ValueError("a film needs at least one frame.")
+    fps, prior, true_resolution = float(fps), float(prior), float(true_resolution)
     if max_frames < 1 or not 0 < fps <= 50:
         raise ValueError(f"max_frames must be >= 1 and fps > 0 and <= 50 Hz, got {max_frames} and {fps}.")
     picked = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), max_frames)).round().astype(int))
     picked[-1] = len(frames) - 1  # of one frame alone, linspace keeps the first
     frames = [frames[k] for k in picked]
+    goal, goal_tolerance, radius = np.asarray(goal, np.float64), float(goal_tolerance), float(radius)
     whole = None
     if true_occupied is not None:
-        true_occupied = np.asarray(true_occupied, bool)
-        whole = look.extent(true_occupied.shape, np.asarray(true_origin), true_resolution)
+        true_occupied, true_origin = np.asarray(true_occupied, bool), np.asarray(true_origin, np.float64)
+        whole = look.extent(true_occupied.shape, true_origin, true_resolution)
     view = _view(frames, goal, goal_tolerance, whole)
     backdrop = _backdrop(view, true_occupied, true_origin, true_resolution)
     legend = marks.legend(WIDTH, prior, hint=true_occupied is not None)
@@ -120,9 +124,10 @@ def _view(frames: list[Frame], goal, goal_tolerance: float, whole) -> View:
     return View(low=(x0, y1 - height / scale), high=(x1, y1), scale=scale, size=(WIDTH, height))
 
 
-def _lookup(values: np.ndarray, origin, resolution: float, view: View, fill: float) -> np.ndarray:
+def _lookup(values: Numbers, origin, resolution: float, view: View, fill: float) -> np.ndarray:
     """Value under each pixel `[height, width]`, row 0 at the top; the largest one if a pixel holds several cells."""
-    values, (h, w) = np.asarray(values, np.float32), np.shape(values)
+    values = np.asarray(values, np.float32)
+    h, w = values.shape
     parts = max(1, int(np.ceil(0.999 / (view.scale * resolution))))
     offset = (np.arange(parts) + 0.5) / parts
     x = view.low[0] + (np.arange(view.size[0])[:, None] + offset) / view.scale
@@ -144,7 +149,7 @@ def _backdrop(view: View, true_occupied, true_origin, true_resolution: float) ->
     ground = np.empty((view.size[1], view.size[0], 3), np.uint8)
     ground[:] = look.rgb(look.UNKNOWN)
     if true_occupied is not None:
-        hint = _lookup(true_occupied, true_origin, float(true_resolution), view, 0.0) > 0.5
+        hint = _lookup(true_occupied, true_origin, true_resolution, view, 0.0) > 0.5
         ground[hint] = look.rgb(marks.UNSEEN_WALL)
     return ground
 
@@ -205,10 +210,13 @@ def _write_gif(file: Path, pictures, fps: float) -> None:
     pictures = list(pictures)
     samples = [pictures[k] for k in sorted(set(np.linspace(0, len(pictures) - 1, 8).astype(int).tolist()))]
     sheet = np.concatenate([np.asarray(p) for p in samples])
-    keys = [channel for colour in KEY_COLOURS for channel in look.rgb(colour)]
-    common = Image.fromarray(sheet).quantize(255 - len(KEY_COLOURS), method=Image.Quantize.MEDIANCUT).getpalette() or []
+    keys = np.asarray([look.rgb(colour) for colour in KEY_COLOURS])
+    common = Image.fromarray(sheet).quantize(255 - len(keys), method=Image.Quantize.MEDIANCUT).getpalette() or []
+    common = np.asarray(common).reshape(-1, 3)
+    # Pillow finds the nearest colour to within a few levels: next to a key colour there may be no other.
+    common = common[np.abs(common[:, None] - keys).max(axis=2).min(axis=1) > 8]
     palette = Image.new("P", (1, 1))
-    palette.putpalette(keys + common)
+    palette.putpalette(np.concatenate([keys, common]).ravel().tolist())
     small = [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
     duration = [max(20, round(1000 / fps))] * len(small)
     duration[-1] = round(1000 * HOLD)
@@ -218,14 +226,20 @@ def _write_gif(file: Path, pictures, fps: float) -> None:
 def _write_mp4(file: Path, pictures, fps: float) -> None:
     """H.264 that every browser plays."""
     try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401
+        import imageio_ffmpeg
     except ImportError as error:
         raise look.MissingExtra from error
-    with imageio.get_writer(
-        file, format="FFMPEG", fps=fps, codec="libx264", pixelformat="yuv420p", quality=8, macro_block_size=2
-    ) as film:
-        for picture in pictures:
-            film.append_data(np.asarray(picture))
-        for _ in range(round(HOLD * fps)):
-            film.append_data(np.asarray(picture))
+    pictures = list(pictures)
+    film = imageio_ffmpeg.write_frames(
+        str(file),
+        pictures[0].size,
+        fps=fps,  # pyright: ignore[reportArgumentType] # it takes fractions
+        codec="libx264",
+        quality=8,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+    )
+    with contextlib.closing(film):
+        film.send(None)
+        for picture in [*pictures, *[pictures[-1]] * round(HOLD * fps)]:
+            film.send(picture.tobytes())

@@ -1,20 +1,26 @@
 """What all pictures share: colours, the dead-end heat, the region that is shown.
 
-The heat is the paper's Fig. 1: green = navigable, red = dead end. It fades out where P_dead says nothing that the prior
-does not say: opacity grows with the distance of P_dead from the prior in log-odds,
-`min(1, |logit P - logit p_0| / FULL_AT)` times `DEAD_OPACITY` above the prior and `OPEN_OPACITY` below it. Lightness
-falls from green to red, so that the order survives in print and for colour-blind readers.
+The heat follows the paper's Fig. 1: green = navigable, red = dead end. Below the prior p_0 it is green; above, the
+colour runs from yellow to red with the risk that planners use, `(P_dead - p_0) / (1 - p_0)`. Where P_dead says nothing
+that the prior does not say, it fades out: opacity grows with the distance from the prior in log-odds,
+`min(1, |logit P_dead - logit p_0| / FULL_AT)`, times `DEAD_OPACITY` above the prior and `OPEN_OPACITY` below. Lightness
+falls from yellow to red, so that the order survives in print and for colour-blind readers.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat, TypeAlias
 
 import numpy as np
+from jaxtyping import Array
+
+Numbers: TypeAlias = np.ndarray | Array | Sequence  # a grid, points or one point, from wherever they come
+Number: TypeAlias = SupportsFloat
 
 PRIOR = 0.06  # base rate of dead-end cells; the default of the filter
 FULL_AT = 1.5  # [nat] from the prior at which the heat is fully opaque
 DEAD_OPACITY, OPEN_OPACITY = 0.75, 0.45  # a warning may shout, the rest is ground
-HEAT_STOPS = ((0.0, "#7fdc8f"), (0.25, "#d3e86f"), (0.5, "#ffc14d"), (0.75, "#f4713c"), (1.0, "#d7263d"))
+OPEN = "#7fdc8f"
+RISK_STOPS = ((0.0, "#fff08a"), (0.2, "#ffd75e"), (0.5, "#fb9a45"), (0.75, "#ee5f3a"), (1.0, "#cf1f3a"))
 
 WALL = "#2b2d33"
 UNKNOWN = "#d9dce1"
@@ -69,7 +75,7 @@ def over_white(colours: np.ndarray) -> np.ndarray:
     return 1.0 - colours[..., 3:] * (1.0 - colours[..., :3])
 
 
-def heat(p_dead: np.ndarray, prior: float = PRIOR) -> np.ndarray:
+def heat(p_dead: Numbers | float, prior: float = PRIOR) -> np.ndarray:
     """Colour of the dead-end heat (module docstring).
 
     Args:
@@ -85,11 +91,13 @@ def heat(p_dead: np.ndarray, prior: float = PRIOR) -> np.ndarray:
     if not 0.0 < prior < 1.0:
         raise ValueError(f"prior must be a probability > 0 and < 1, got {prior}.")
     p = np.clip(np.nan_to_num(np.asarray(p_dead, np.float32), nan=prior), 1e-4, 1.0 - 1e-4)
-    at = [stop for stop, _ in HEAT_STOPS]
-    colours = np.asarray([rgb(colour) for _, colour in HEAT_STOPS], np.float32) / 255.0
     distance = np.abs(np.log(p / (1.0 - p)) - np.log(prior / (1.0 - prior)))
-    opacity = np.minimum(1.0, distance / FULL_AT) * np.where(p > prior, DEAD_OPACITY, OPEN_OPACITY)
-    return np.stack([*(np.interp(p, at, channel) for channel in colours.T), opacity], axis=-1).astype(np.float32)
+    risk = (p - prior) / (1.0 - prior)
+    at = [stop for stop, _ in RISK_STOPS]
+    scale = np.asarray([rgb(colour) for _, colour in RISK_STOPS]).T
+    colour = [np.where(risk > 0, np.interp(risk, at, c), g) / 255.0 for c, g in zip(scale, rgb(OPEN), strict=True)]
+    opacity = np.minimum(1.0, distance / FULL_AT) * np.where(risk > 0, DEAD_OPACITY, OPEN_OPACITY)
+    return np.stack([*colour, opacity], axis=-1).astype(np.float32)
 
 
 def region(
@@ -128,7 +136,7 @@ def region(
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
-def extent(shape: tuple[int, ...], origin: np.ndarray, resolution: float) -> tuple[float, float, float, float]:
+def extent(shape: tuple[int, ...], origin: Numbers, resolution: Number) -> tuple[float, float, float, float]:
     """x_min, y_min, x_max, y_max [m] of a grid `[H, W]`."""
     x, y = (float(v) for v in np.asarray(origin))
     return x, y, x + shape[1] * float(resolution), y + shape[0] * float(resolution)

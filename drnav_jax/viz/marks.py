@@ -12,10 +12,11 @@ FINE = 2
 ROBOT, LOCAL_GOAL, INK, UNSEEN_WALL = "#5b21b6", "#e6007e", "#1f2329", "#c2c6cd"
 LEGEND_HEIGHT, MARGIN = 34, 12
 
-Pixel = tuple[float, float]
+Length = float | int
+Pixel = tuple[Length, Length]
 
 
-def font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+def font(size: Length) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """Pillow's own font: the same everywhere."""
     return ImageFont.load_default(size)
 
@@ -26,34 +27,34 @@ def _outline(xy: Pixel, arms: np.ndarray, angles: np.ndarray) -> list[Pixel]:
     return [(x, y) for x, y in corners.tolist()]
 
 
-def dot(draw: ImageDraw.ImageDraw, xy: Pixel, radius: float, colour: str) -> None:
+def dot(draw: ImageDraw.ImageDraw, xy: Pixel, radius: Length, colour: str) -> None:
     """A disc with a white rim."""
     for r, fill in ((radius + 1.0, "white"), (radius, colour)):
         r *= FINE
         draw.ellipse((xy[0] - r, xy[1] - r, xy[0] + r, xy[1] + r), fill=fill)
 
 
-def robot(draw: ImageDraw.ImageDraw, xy: Pixel, yaw: float, radius: float) -> None:
+def robot(draw: ImageDraw.ImageDraw, xy: Pixel, yaw: Length, radius: Length) -> None:
     """A disc with a white arrow that points ahead."""
     dot(draw, xy, radius, ROBOT)
     arms = FINE * radius * np.asarray([0.85, 0.8, 0.25, 0.8])
     draw.polygon(_outline(xy, arms, np.asarray([0.0, 2.5, np.pi, -2.5]) - yaw), fill="white")
 
 
-def star(draw: ImageDraw.ImageDraw, xy: Pixel, radius: float) -> None:
+def star(draw: ImageDraw.ImageDraw, xy: Pixel, radius: Length) -> None:
     """The goal."""
     angles, arms = np.pi * (np.arange(10) / 5 - 0.5), np.where(np.arange(10) % 2, 0.42, 1.0)
     for r, fill in ((1.3 * radius, INK), (radius, look.GOAL)):
         draw.polygon(_outline(xy, FINE * r * arms, angles), fill=fill)
 
 
-def diamond(draw: ImageDraw.ImageDraw, xy: Pixel, radius: float) -> None:
+def diamond(draw: ImageDraw.ImageDraw, xy: Pixel, radius: Length) -> None:
     """The local goal g*."""
     for r, fill in ((radius + 1.5, "white"), (radius, LOCAL_GOAL)):
         draw.polygon(_outline(xy, np.full(4, FINE * r), np.arange(4) * np.pi / 2), fill=fill)
 
 
-def circle(draw: ImageDraw.ImageDraw, xy: Pixel, radius: float) -> None:
+def circle(draw: ImageDraw.ImageDraw, xy: Pixel, radius: Length) -> None:
     """The goal's tolerance."""
     r = FINE * radius
     draw.ellipse((xy[0] - r, xy[1] - r, xy[0] + r, xy[1] + r), outline=INK, width=FINE)
@@ -79,7 +80,7 @@ def dashed(draw: ImageDraw.ImageDraw, start: Pixel, end: Pixel) -> None:
         draw.line([(float(x), float(y)) for x, y in ends], fill=LOCAL_GOAL, width=3 * FINE // 2)
 
 
-def chip(draw: ImageDraw.ImageDraw, left: float, middle: float, text: str, colour: str) -> None:
+def chip(draw: ImageDraw.ImageDraw, left: Length, middle: Length, text: str, colour: str) -> None:
     """White words on a rounded ground, at the finished size."""
     letters = font(15)
     right = left + 20 + letters.getlength(text)
@@ -87,7 +88,7 @@ def chip(draw: ImageDraw.ImageDraw, left: float, middle: float, text: str, colou
     draw.text((left + 10, middle), text, fill="white", font=letters, anchor="lm")
 
 
-def scale_bar(draw: ImageDraw.ImageDraw, right: float, bottom: float, scale: float, longest: float) -> None:
+def scale_bar(draw: ImageDraw.ImageDraw, right: Length, bottom: Length, scale: Length, longest: Length) -> None:
     """A round length in metres, at the finished size; `scale` in pixels per metre, `longest` in pixels."""
     length = max(m for m in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if m * scale <= longest or m == 0.1)
     left = right - length * scale
@@ -118,7 +119,7 @@ def legend(width: int, prior: float, hint: bool) -> Image.Image:
         "local goal g*": lambda xy: diamond(draw, xy, 5.5),
         "goal": lambda xy: star(draw, xy, 7),
         "recovery": lambda xy: dot(draw, xy, 5, look.RECOVERY),
-        "unseen": unknown,
+        "unknown": unknown,
     }
     for text, symbol in entries.items():
         symbol((x + 8 * FINE, y))

@@ -7,12 +7,17 @@ import numpy as np
 
 from drnav_jax.types import GridMap
 from drnav_jax.viz import look
+from drnav_jax.viz.look import Number, Numbers
 
 SUFFIXES = (".png", ".pdf", ".svg")
 DPI = 150
-MAP_WIDTH = (5.4, 7.9)  # [inch] with the legend beside the map, and with it below
+MIN_WIDTH, MAX_WIDTH = 1000 / DPI, 1400 / DPI  # [inch] of the picture
+GAP = 0.16  # [inch] between the blocks of the legend
+MAP_WIDTH = (5.4, 7.8)  # [inch] with the legend beside the map, and with it below
+ASPECT = (0.6, 1.9)  # width / height of the map: a straight trip still shows what it passed
+BESIDE = 1.25  # width / height of the map below which the legend stands beside it
 MAP_HEIGHT = 7.6  # [inch] at most
-ROOM = (0.62, 0.16, 0.46, 0.44)  # [inch] left, right, below and above the map: ticks, labels and title
+ROOM = (0.74, 0.16, 0.46, 0.44)  # [inch] left, right, below and above the map: ticks, labels and title
 LINE = 2.3  # [pt]
 UNSEEN = "#e9ebee"
 CROSS = 11.0  # [pt]
@@ -21,20 +26,20 @@ CROSS = 11.0  # [pt]
 def trajectories(
     file: str | Path,
     *,
-    occupied: np.ndarray,
-    origin: tuple[float, float],
-    resolution: float,
-    start: tuple[float, float, float],
-    goal: tuple[float, float],
-    goal_tolerance: float,
-    paths: Mapping[str, np.ndarray],
+    occupied: Numbers,
+    origin: Numbers,
+    resolution: Number,
+    start: Numbers,
+    goal: Numbers,
+    goal_tolerance: Number,
+    paths: Mapping[str, Numbers],
     outcome: Mapping[str, str] | None = None,
     p_dead: GridMap | None = None,
-    known: np.ndarray | None = None,
-    recovery_points: np.ndarray | None = None,
-    shortest: np.ndarray | None = None,
+    known: Numbers | None = None,
+    recovery_points: Numbers | None = None,
+    shortest: Numbers | None = None,
     title: str = "",
-    prior: float = look.PRIOR,
+    prior: Number = look.PRIOR,
 ) -> Path:
     """Draw the paths that planners drove, over the world and the dead-end belief of one of them.
 
@@ -65,7 +70,11 @@ def trajectories(
     file = Path(file)
     if file.suffix.lower() not in SUFFIXES:
         raise ValueError(f'a picture is written as {", ".join(SUFFIXES)}, got "{file.name}".')
-    occupied = np.asarray(occupied, bool)
+    occupied, origin, resolution = np.asarray(occupied, bool), np.asarray(origin, np.float64), float(resolution)
+    start, goal, goal_tolerance = np.asarray(start, np.float64), np.asarray(goal, np.float64), float(goal_tolerance)
+    prior = float(prior)
+    if start.shape != (3,) or goal.shape != (2,):
+        raise ValueError(f"start must be x, y, yaw and goal x, y; got shapes {start.shape} and {goal.shape}.")
     if occupied.ndim != 2:
         raise ValueError(f"occupied must be [H, W], got shape {occupied.shape}.")
     if not paths:
@@ -86,23 +95,24 @@ def trajectories(
     except ImportError as error:
         raise look.MissingExtra from error
 
-    around = np.asarray([[1, 0], [-1, 0], [0, 1], [0, -1]]) * goal_tolerance + np.asarray(goal)
-    must = [*lines.values(), around, np.asarray(start)[None, :2], *([] if optimum is None else [optimum])]
+    around = np.asarray([[1, 0], [-1, 0], [0, 1], [0, -1]]) * goal_tolerance + goal
+    must = [*lines.values(), around, start[None, :2], *([] if optimum is None else [optimum])]
     span = np.ptp(np.concatenate(must), axis=0).max()
-    whole = look.extent(occupied.shape, np.asarray(origin), resolution)
-    view = look.region(np.concatenate(must), margin=max(2.0, 0.08 * span), aspect=(0.6, 3.0), bounds=whole)
+    whole = look.extent(occupied.shape, origin, resolution)
+    view = look.region(np.concatenate(must), margin=max(2.0, 0.08 * span), aspect=ASPECT, bounds=whole)
 
     figure = Figure(dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
-    wall = np.zeros((*occupied.shape, 4), np.float32)
-    wall[occupied] = (*_rgb(look.WALL), 1.0)
     if p_dead is not None:
         seen = np.ones(np.shape(p_dead.values), bool) if known is None else np.asarray(known, bool)
         colours = np.where(seen[..., None], look.over_white(look.heat(p_dead.values, prior)), _rgb(UNSEEN))
         axes.set_facecolor(UNSEEN)  # what lies outside the belief's window is not known either
         _image(axes, colours, np.asarray(p_dead.origin), float(p_dead.resolution), view, zorder=1)
-    _image(axes, wall, np.asarray(origin), resolution, view, zorder=2)
+    pixel = (view[2] - view[0]) / (_map_size(view)[0] * DPI)
+    cells = max(1, int(np.ceil(1.2 * pixel / resolution)))
+    wall = _pooled(occupied, cells)[..., None] * np.asarray((*_rgb(look.WALL), 1.0), np.float32)
+    _image(axes, wall, origin, resolution * cells, view, zorder=2)
 
     shown = look.strokes(list(lines))
     handles = []
@@ -128,10 +138,10 @@ def trajectories(
     disc = {"facecolor": (1.0, 0.8, 0.0, 0.22), "edgecolor": "black", "linewidth": 0.9}
     axes.add_patch(Circle((float(goal[0]), float(goal[1])), goal_tolerance, zorder=3, **disc))
     points = points[((points > view[:2]) & (points < view[2:])).all(axis=1)]
-    handles += _symbols(axes, start, goal, goal_tolerance, points, optimum is not None)
+    symbols = _symbols(axes, start, goal, goal_tolerance, points, optimum is not None)
     if p_dead is not None:
-        handles += _surfaces(prior)
-    _arrange(figure, axes, view, handles, title)
+        symbols += _surfaces(prior)
+    _arrange(figure, axes, view, [handles, symbols], title)
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file)
     return file
@@ -141,7 +151,7 @@ def _rgb(colour: str) -> tuple[float, ...]:
     return tuple(c / 255.0 for c in look.rgb(colour))
 
 
-def _points(values: np.ndarray, what: str) -> np.ndarray:
+def _points(values: Numbers, what: str) -> np.ndarray:
     """The finite rows of `[N, 2]`."""
     points = np.asarray(values, np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
@@ -149,7 +159,21 @@ def _points(values: np.ndarray, what: str) -> np.ndarray:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _image(axes, colours: np.ndarray, origin: np.ndarray, resolution: float, view, zorder: float) -> None:
+def _pooled(occupied: np.ndarray, cells: int) -> np.ndarray:
+    """Whether anything is occupied in each block of cells, so that no thin wall falls between two pixels."""
+    h, w = occupied.shape
+    padded = np.pad(occupied, ((0, -h % cells), (0, -w % cells)))
+    return np.any(padded.reshape(-(-h // cells), cells, -(-w // cells), cells), axis=(1, 3))
+
+
+def _map_size(view: tuple[float, float, float, float]) -> tuple[float, float]:
+    """Width and height of the map on paper [inch]."""
+    aspect = (view[2] - view[0]) / (view[3] - view[1])
+    width = min(MAP_WIDTH[0 if aspect < BESIDE else 1], MAP_HEIGHT * aspect)
+    return width, width / aspect
+
+
+def _image(axes, colours: np.ndarray, origin: np.ndarray, resolution: float, view, zorder: int) -> None:
     """Draw the part of a grid of colours `[H, W, 3 or 4]` that is in view."""
     h, w = colours.shape[:2]
     low = np.clip(np.floor((np.asarray(view[:2]) - origin) / resolution), 0, (w, h)).astype(int)
@@ -168,10 +192,11 @@ def _ending(axes, end: np.ndarray, stroke: look.Stroke, ended: str | None, cover
     kind = {"color": stroke.colour, "linewidth": LINE, "linestyle": (0, stroke.dashes) if stroke.dashes else "-"}
     label = stroke.label if ended is None else f"{stroke.label} ({ended})"
     mark = {"marker": "o", "markersize": 6.5, "markeredgecolor": "white", "markeredgewidth": 1.0}
+    drawn = mark
     if ended is not None and not ended.lower().startswith("reached"):
         mark |= {"marker": "X", "markersize": CROSS}
-    larger = {**mark, "markersize": mark["markersize"] * (1.0 + 0.55 * covered)}
-    axes.plot(*end, color=stroke.colour, linestyle="none", zorder=7, **larger)
+        drawn = mark | {"markersize": CROSS * (1.0 + 0.55 * covered)}
+    axes.plot(*end, color=stroke.colour, linestyle="none", zorder=7, **drawn)
     return Line2D([], [], label=label, **kind, **(mark if ended is not None else {}))
 
 
@@ -217,59 +242,62 @@ def _surfaces(prior: float) -> list:
     """The legend's entries for the dead-end belief."""
     from matplotlib.patches import Patch
 
-    colours = look.over_white(look.heat(np.linspace(0.0, 1.0, 50), prior))
+    colours = look.over_white(look.heat(np.linspace(prior, 1.0, 50), prior))
     strip = _Strip(Patch(facecolor=tuple(c), edgecolor="none", linewidth=0) for c in colours)
-    strip.label = "P(dead end), 0 to 1"
-    return [strip, Patch(facecolor=UNSEEN, edgecolor="#b4b8bf", linewidth=0.6, label="not in the map")]
+    strip.label = f"P(dead end), {prior:g} to 1"
+    below = look.over_white(look.heat(0.0, prior))
+    return [
+        Patch(facecolor=tuple(below), edgecolor="none", label=f"P(dead end) < {prior:g}"),
+        strip,
+        Patch(facecolor=UNSEEN, edgecolor="#b4b8bf", linewidth=0.6, label="unknown to the robot"),
+    ]
 
 
-def _arrange(figure, axes, view, handles: list, title: str) -> None:
+def _arrange(figure, axes, view, groups: list[list], title: str) -> None:
     """Axes in metres at one scale; the legend below a wide map, beside a tall one, never over it."""
     from matplotlib.legend_handler import HandlerTuple
+    from matplotlib.ticker import MaxNLocator
 
-    width, height = view[2] - view[0], view[3] - view[1]
-    beside = width / height < 1.25
-    map_width = min(MAP_WIDTH[0 if beside else 1], MAP_HEIGHT * width / height)
-    map_height = map_width * height / width
-    left, right, below, above = ROOM
+    left, right, below, above = ROOM if title else (*ROOM[:3], 0.15)
+    map_width, map_height = _map_size(view)
+    beside = map_width / map_height < BESIDE
 
-    labels = [handle.get_label() for handle in handles]
-
-    def legend(columns: int):
-        for old in list(figure.legends):
-            old.remove()
-        return figure.legend(
-            handles, labels, loc="lower left", ncols=columns, frameon=False, fontsize=9, handlelength=3.0,
-            columnspacing=1.8, labelspacing=0.55, borderaxespad=0.0, borderpad=0.0,
+    def legend(handles: list, columns: int):
+        """A block with as many columns as fit below the map, and its size [inch]."""
+        box = figure.legend(
+            handles, [handle.get_label() for handle in handles], loc="lower left", ncols=columns, frameon=False,
+            fontsize=9, handlelength=3.4, columnspacing=1.8, labelspacing=0.55, borderaxespad=0.0, borderpad=0.0,
             handler_map={_Strip: HandlerTuple(ndivide=None, pad=0.0)},
         )  # fmt: skip
+        size = box.get_window_extent(figure.canvas.get_renderer())
+        if columns > 1 and size.width / DPI > map_width:
+            box.remove()
+            return legend(handles, columns - 1)
+        return box, size.width / DPI, size.height / DPI
 
-    def size(box) -> tuple[float, float]:
-        extent = box.get_window_extent(figure.canvas.get_renderer())
-        return extent.width / DPI, extent.height / DPI
-
-    columns = 1 if beside else min(4, len(handles))
-    box = legend(columns)
-    while columns > 1 and size(box)[0] > left + map_width:
-        columns -= 1
-        box = legend(columns)
-    box_width, box_height = size(box)
+    blocks = [legend(group, 1 if beside else len(group)) for group in groups]
+    block_width, block_height = max(b[1] for b in blocks), sum(b[2] for b in blocks) + GAP * (len(blocks) - 1)
     if beside:
-        total = (left + map_width + 0.2 + box_width + right, above + max(map_height, box_height) + below)
-        total = (max(total[0], 1000 / DPI), total[1])
-        place = (left + map_width + 0.2, total[1] - above - box_height)
-        bottom = total[1] - above - map_height
+        shrink = min(1.0, max(0.6, (MAX_WIDTH - left - 0.2 - block_width - right) / map_width))  # for long words
+        map_width, map_height = map_width * shrink, map_height * shrink
+        width = max(left + map_width + 0.2 + block_width + right, MIN_WIDTH)
+        height = above + max(map_height + below, block_height + right)
+        x, top, bottom = left + map_width + 0.2, height - above, height - above - map_height
     else:
-        total = (left + map_width + right, above + map_height + below + box_height + 0.2)
-        place, bottom = (left, 0.14), below + box_height + 0.2
-    figure.set_size_inches(*total)
-    axes.set_position((left / total[0], bottom / total[1], map_width / total[0], map_height / total[1]))
-    box.set_loc((place[0] / total[0], place[1] / total[1]))
+        width, height = left + map_width + right, above + map_height + below + GAP + block_height + right
+        x, top, bottom = left, right + block_height, height - above - map_height
+    figure.set_size_inches(width, height)
+    axes.set_position((left / width, bottom / height, map_width / width, map_height / height))
+    for box, _, tall in blocks:
+        box.set_loc((x / width, (top - tall) / height))
+        top -= tall + GAP
 
     axes.set(xlim=(view[0], view[2]), ylim=(view[1], view[3]), aspect="auto")
     axes.set_xlabel("x [m]", fontsize=9, labelpad=2)
     axes.set_ylabel("y [m]", fontsize=9, labelpad=2)
     axes.tick_params(labelsize=8.5, length=3)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=8, steps=[1, 2, 5, 10]))
     for spine in axes.spines.values():
         spine.set(color="#8a8f98", linewidth=0.8)
     axes.set_axisbelow(False)

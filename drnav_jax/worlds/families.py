@@ -43,9 +43,9 @@ RANGES: dict[str, dict[str, tuple[tuple[float, float], tuple[float, float]]]] = 
     "u": {
         "ahead": ((4, 8), (3, 9)),  # start to mouth
         "depth": ((5, 8), (4, 10)),  # mouth to back wall
-        "width": ((3, 4.5), (2.5, 5.5)),  # between the side walls, at the back
+        "width": ((3, 4.2), (2.8, 4.7)),  # between the side walls, at the back
         "flare": ((0, 10), (-5, 20)),  # angle by which a side wall opens toward the mouth
-        "door": ((1.6, 2.2), (1.4, 2.4)),  # in the back wall of the open twin
+        "door": ((1.6, 2.2), (1.4, 2.2)),  # in the back wall of the open twin
         "behind": ((4, 7), (3, 8)),  # back wall to goal
     },
     "corridor": {

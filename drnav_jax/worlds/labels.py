@@ -90,8 +90,8 @@ def dead_ends(
         resolution: Cell size h [m].
         spec: The robot, and what is of interest.
         trip_path: (row, column) of the cells of the shortest path from start to goal, ends included.
-        clearance: d of eq. 1 [m] in the grid if it is known better than from `occupied`; it must not
-            be cut off below W / 2.
+        clearance: d of eq. 1 [m], used inside the grid if it is known better than from `occupied`;
+            it must not be truncated at or below W / 2.
         spacing: Gates nearer than this [m] to one taken before are skipped; 0 skips none.
 
     Returns:
@@ -117,7 +117,7 @@ def dead_ends(
     squares = np.floor((reach[tuple(gates.T)] / resolution + 1.0) ** 2).astype(int)
     anchors = np.array([[1, 1]])
     if trip_path is not None:
-        path = trip_path + pad
+        path = trip_path.astype(int) + pad
         anchors = np.concatenate([anchors, path[free[tuple(path.T)]]])
         apart = np.rint(spatial.KDTree(path).query(gates)[0] ** 2) > squares
         gates, squares = gates[apart], squares[apart]
@@ -126,7 +126,7 @@ def dead_ends(
     gap = _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec)
     label = np.isfinite(gap)
     inside = (slice(pad, -pad), slice(pad, -pad))
-    pocket = ndimage.label(label, _CROSS)[0][inside]
+    pocket = _label(label)[inside]
     number = np.cumsum(np.bincount(pocket[pocket > 0], minlength=2) > 0)  # some lie outside
     return DeadEndLabels(
         label=label[inside],
@@ -139,22 +139,18 @@ def dead_ends(
 def _check(occupied, resolution, trip_path, clearance, spacing):
     shape = occupied.shape
     if occupied.ndim != 2 or occupied.dtype != bool or not occupied.size:
-        got = f"{occupied.dtype} of shape {shape}"
-        raise ValueError(f"occupied must be a grid [H, W] of bool with H, W > 0, got {got}.")
+        raise ValueError(f"occupied must be [H, W] of bool, not {shape} of {occupied.dtype}.")
     if not 0 < resolution < np.inf:
         raise ValueError(f"resolution must be > 0 m, got {resolution}.")
     if not 0 <= spacing < np.inf:
         raise ValueError(f"spacing must be >= 0 m, got {spacing}.")
     if clearance is not None and (clearance.shape != shape or np.isnan(clearance).any()):
-        got = f"shape {clearance.shape}, {np.isnan(clearance).sum()} NaN"
-        raise ValueError(f"clearance must be in m on the grid of shape {shape}, got {got}.")
+        raise ValueError(f"clearance must be {shape} in m without NaN, got {clearance.shape}.")
     if trip_path is not None:
         if trip_path.ndim != 2 or trip_path.shape[1] != 2 or not len(trip_path):
-            raise ValueError(f"trip_path must be [L, 2] with L > 0, got shape {trip_path.shape}.")
-        outside = ((trip_path < 0) | (trip_path >= shape)).any(axis=1)
-        if outside.any():
-            cell = trip_path[outside][0].tolist()
-            raise ValueError(f"trip_path must stay in the grid of shape {shape}, got cell {cell}.")
+            raise ValueError(f"trip_path must be [L, 2] with L > 0, got {trip_path.shape}.")
+        for cell in trip_path[((trip_path < 0) | (trip_path >= shape)).any(axis=1)].tolist():
+            raise ValueError(f"trip_path must stay in the {shape} cells of the grid, got {cell}.")
 
 
 def _clearance(occupied, resolution, known, pad):
@@ -166,10 +162,17 @@ def _clearance(occupied, resolution, known, pad):
     if known is not None:
         squares = np.clip(known.astype(float) / resolution + 0.5, 0, 1e6) ** 2
         # On a grid they are integers: without float32's noise ties fall as if d were not given.
-        whole = np.abs(squares - np.rint(squares)) < 1e-3
+        whole = np.abs(squares - np.rint(squares)) < 1e-2
         squares[whole] = np.rint(squares[whole])
         d[pad:-pad, pad:-pad] = np.sqrt(squares) * resolution - 0.5 * resolution
     return d
+
+
+def _label(mask):
+    """Number of the 4-connected component of each cell, 0 outside the mask."""
+    component = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, _CROSS, output=component)
+    return component
 
 
 def _thinned(gates, shape, step):
@@ -266,11 +269,11 @@ def _rim(squares: int, shape: tuple[int, int]) -> _Rim:
 
 def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
     """Gap [m] of the narrowest gate that cuts each cell off, inf where none does (eq. 5)."""
-    part, num_parts = ndimage.label(free, _CROSS)
-    part_area = np.bincount(part[counted], minlength=num_parts + 1)
-    closed = np.ones(num_parts + 1, bool)
+    part = _label(free)
+    part_area = np.bincount(part[counted], minlength=part.max() + 1)
+    closed = np.ones(len(part_area), bool)
     closed[np.append(part[tuple(anchors.T)], 0)] = False
-    root = np.zeros(num_parts + 1, int)
+    root = np.zeros(len(part_area), int)
     root[part.ravel()] = np.arange(part.size)  # any cell of each part
     roots = np.append(np.unique(anchors @ (free.shape[1], 1)), root[closed])
     rng = np.random.default_rng(0)
@@ -291,12 +294,12 @@ def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
         width = 2 * (rho + spec.radius)
         need = max(2 * spec.radius + 0.5, spec.depth_ratio * width)
         spans = _spans(lo, hi, sign)
-        if area > np.pi * ((need + rho) / resolution + 1) ** 2 or any(  # no disc holds that many
-            np.sqrt(((row[s] - i) ** 2 + (column[s] - j) ** 2).max()) * resolution - rho >= need
-            for s in spans
-        ):
-            for s in spans:
-                gap[s] = width
+        if area <= np.pi * ((need + rho) / resolution + 1) ** 2:  # else some must lie far enough
+            square = max(((row[s] - i) ** 2 + (column[s] - j) ** 2).max() for s in spans)
+            if np.sqrt(square) * resolution - rho < need:
+                continue
+        for s in spans:
+            gap[s] = width
     out = np.full(free.size, np.inf)
     out[tree.cell] = gap
     return out.reshape(free.shape)

@@ -14,6 +14,7 @@ from drnav_jax.worlds.world import WALL_HEIGHT, World, no_field, signed_distance
 
 WAY = 1.2  # [m] width that clutter leaves free along every passage
 WING = 50.0  # [m] of wall to either side of a block
+MOUTH = 4.9  # [m] the widest of a cul-de-sac; wider ones are bays, not dead ends
 REAR = 7.0  # [m] of stem or fence behind the start
 
 Rect = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
@@ -80,8 +81,10 @@ def _block(
     """A block with passages and the wall that it stands in, which on one side runs back first."""
     thickness = rng.uniform(0.2, 0.3)
     x, back, low, high = hull[0] + thickness / 2, hull[0] - fence, hull[1], hull[3]
-    walls = [_wall((x, low), (x, low - WING), thickness), _wall((back, high), (x, high), thickness)]
-    return [*_carved(hull, free), *walls, _wall((back, high), (back, high + WING), thickness)]
+    turns = [(x, high), (back, high)] if fence > 0 else [(x, high)]
+    wing = [*turns, (turns[-1][0], high + WING)]
+    walls = [_wall(a, b, thickness) for a, b in zip(wing[:-1], wing[1:], strict=True)]
+    return [*_carved(hull, free), *walls, _wall((x, low), (x, low - WING), thickness)]
 
 
 def _open(draw: Draw, rng: np.random.Generator) -> Layout:
@@ -110,9 +113,9 @@ def _u(draw: Draw, rng: np.random.Generator) -> Layout:
     back = ahead + depth
     low, high = shift - width / 2, shift + width / 2
     spread = [depth * math.tan(math.radians(draw("flare"))) for _ in range(2)]
-    spread = [max(s, -0.2 * width) for s in spread]
+    spread = [min(max(s, -0.2 * width), (MOUTH - width) / 2) for s in spread]
     door = draw("door")
-    middle = rng.uniform(low + 0.2 + door / 2, high - 0.2 - door / 2)
+    middle = shift + rng.uniform(-0.5, 0.5) * (width - door - 0.5)
     sides = [
         _wall((ahead, low - spread[0]), (back, low), thickness),
         _wall((ahead, high + spread[1]), (back, high), thickness),
@@ -199,7 +202,8 @@ def _l(draw: Draw, rng: np.random.Generator) -> Layout:
     h = width / 2
     corner = stem + straight
     far = corner + h + end
-    exit_y = h + depth - h  # centre line of the way out that only the open twin has
+    exit_y = max(depth, width + 0.3)  # centre line of the way out that only the open twin has
+    aside = max(aside, exit_y + 0.5)  # the detour is the longer way
     hull = (-REAR, -aside - h - rng.uniform(0.3, 2), far, exit_y + h + rng.uniform(0.3, 2))
     free = [
         (-REAR, -h, corner + h, h),
@@ -213,7 +217,7 @@ def _l(draw: Draw, rng: np.random.Generator) -> Layout:
     detour = np.array([[stem, 0], [stem, -aside], [far, -aside]])
     return Layout(
         walls=_block(hull, free, rng),
-        plugs=[_solid((corner + h, max(exit_y - h, h), far, exit_y + h))],
+        plugs=[_solid((corner + h, exit_y - h, far, exit_y + h))],
         doorposts=[],
         ways=[np.array([*line, goal]) for line in (blocked, detour)],
         corridors=[(blocked, width), (detour, width)],

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import yaml
 from PIL import Image
+from scipy import ndimage
 
 from drnav_jax.worlds.world import Scene, from_grid
 
@@ -207,19 +208,39 @@ def load_map_server(path: str | os.PathLike) -> Scene:
     return map_scene(Path(path).stem, occupied, origin, resolution)
 
 
-def load_floor_plan(path: str | os.PathLike, resolution: float) -> Scene:
+def _fill_outside(occupied: np.ndarray, resolution: float, gap: float) -> np.ndarray:
+    """Walls plus whatever a disc of diameter `gap` [m] sweeps that rolls in from the border."""
+    radius = gap / 2 / resolution
+    padded = np.pad(occupied, math.ceil(radius) + 2)
+    passable = ndimage.distance_transform_edt(~padded) > radius
+    parts, _ = ndimage.label(passable)
+    swept = ndimage.distance_transform_edt(parts != parts[0, 0]) <= radius
+    cut = math.ceil(radius) + 2
+    return occupied | swept[cut:-cut, cut:-cut]
+
+
+def load_floor_plan(
+    path: str | os.PathLike, resolution: float, outside_gap: float | None = None
+) -> Scene:
     """The world of an image in which light pixels (luminance >= 0.5, opaque) are free.
 
     Args:
         path: The image; its lower left corner becomes the world's origin.
         resolution: Edge of a pixel [m].
+        outside_gap: Where the surroundings of the building are light too: what can be reached from
+            the image's border through gaps wider than this [m] is filled. None fills nothing.
 
     Raises:
-        ValueError: If the image cannot be read, nothing in it is free, or the resolution is not
-            > 0.
+        ValueError: If the image cannot be read, nothing in it is free, or a number is not > 0.
     """
     resolution = check_resolution(resolution, str(path))
     grey, opaque = _read_image(Path(path))
     occupied = ~((grey >= 127.5) & opaque)[::-1]
     need_free(occupied, str(path), "free space must be the light part of the image.")
+    if outside_gap is not None:
+        gap = read_number(outside_gap, str(path), "outside_gap")
+        if gap <= 0:
+            raise ValueError(f"{path}: outside_gap must be > 0 m, got {outside_gap}.")
+        occupied = _fill_outside(occupied, resolution, gap)
+        need_free(occupied, str(path), f"gaps wider than {gap} m let the outside in; widen that.")
     return map_scene(Path(path).stem, occupied, (0.0, 0.0), resolution)

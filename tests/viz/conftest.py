@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from drnav_jax.types import GridMap
 from drnav_jax.viz import Frame
@@ -82,3 +83,33 @@ def film(case: Case, count: int) -> list[Frame]:
 @pytest.fixture(scope="session")
 def case() -> Case:
     return cul_de_sac()
+
+
+@pytest.fixture(scope="session")
+def frames(case) -> list[Frame]:
+    return film(case, 12)
+
+
+class Spot(NamedTuple):
+    """The largest patch of one colour: its middle and its box, in pixels from the upper left."""
+
+    x: float
+    y: float
+    width: int
+    height: int
+    count: int
+
+
+@pytest.fixture(scope="session")
+def spot():
+    def find(picture: np.ndarray, colour: str, tolerance: int = 3) -> Spot:
+        wanted = np.asarray([int(colour[k : k + 2], 16) for k in (1, 3, 5)])
+        near = (np.abs(picture[..., :3].astype(int) - wanted) <= tolerance).all(axis=-1)
+        patches, count = ndimage.label(near)
+        if not count:
+            return Spot(np.nan, np.nan, 0, 0, 0)
+        largest = 1 + int(np.argmax(ndimage.sum_labels(near, patches, np.arange(1, count + 1))))
+        y, x = np.nonzero(patches == largest)
+        return Spot(float(x.mean()), float(y.mean()), int(np.ptp(x)) + 1, int(np.ptp(y)) + 1, len(x))
+
+    return find
