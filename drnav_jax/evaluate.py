@@ -115,7 +115,7 @@ def policy_of(spec: NavSpec) -> episode.Policy:
 
 def plan_margin(params: NavParams) -> float:
     """The outermost planning margin beyond the radius [m]: what the optimal time is computed with."""
-    return float(params.route.margin)
+    return float(params.route.closed_margin) + 0.04
 
 
 def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:

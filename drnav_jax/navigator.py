@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from drnav_jax import geometry, grids
-from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief, dead_end
+from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief, dead_end, occupancy
 from drnav_jax.filter import recovery as recovery_points
 from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
 from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
@@ -90,6 +90,7 @@ class NavParams(NamedTuple):
     recovery: RecoveryParams = RecoveryParams()
     recovery_points: RecoveryPointParams = RecoveryPointParams()
     predictor: Any = geometric.GeometricParams()
+    squeeze_time: Scalar = 5.0  # [] how long narrow ways stay allowed after none was found [s]
     hysteresis: Scalar = 0.3  # [] advantage of the last g* [m]
     goal_tolerance: Scalar = 0.75  # [] nearer than this the robot has arrived and stops [m]
     pose_jump: Scalar = 1.0  # [] the map is dropped when odometry leaps farther than this in one tick [m]
@@ -101,6 +102,7 @@ class NavState(NamedTuple):
     belief: FilterState
     plan: Array  # [H, W] int32 words of `costmap.pack_plan`
     reachable: Array  # [] bool, a way to the goal is known or may exist
+    squeeze_until: Array  # [] until then narrower ways than usual are taken, since there was no other [s]
     risk: Array  # [H, W] P_dead^foot above the prior
     points: RecoveryPoints
     recovery: RecoveryState
@@ -138,6 +140,7 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
         belief=belief.init(spec.filter, params.filter, pose[:2]),
         plan=jnp.zeros(shape, jnp.int32),
         reachable=jnp.asarray(True),
+        squeeze_until=jnp.zeros((), jnp.float32),
         risk=jnp.zeros(shape, jnp.float32),
         points=recovery_points.init(spec.recovery_points),
         recovery=behaviour.init(spec.filter.grid, pose[:2]),
@@ -190,6 +193,20 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
     return state._replace(belief=moved, plan=plan, risk=risk, recovery=state.recovery._replace(visits=visits))
 
 
+def _local_corner(spec: NavSpec) -> tuple[int, int]:
+    """(row, column) of the window at which the square for rollouts begins."""
+    h, w = spec.filter.grid.shape
+    return (h - spec.local_cells) // 2, (w - spec.local_cells) // 2
+
+
+def _fine_clearance(spec: NavSpec, held: FilterState) -> Float[Array, "n n"]:
+    """Clearance [m] around the robot on cells of half the map's edge, from where surfaces lie within their cells."""
+    n, (top, left) = spec.local_cells, _local_corner(spec)
+    crop = lambda a: a[top : top + n, left : left + n]  # noqa: E731
+    fine = occupancy.fine_obstacles(crop(held.seen & (held.occupancy > 0)), crop(held.surface))
+    return costmap.clearance(fine, spec.filter.grid.resolution / 2)
+
+
 def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation) -> NavState:
     """Evidence -> belief -> risk; recovery points; cost-to-go."""
     grid, planner, robot = spec.filter.grid, spec.planner, params.robot
@@ -202,6 +219,9 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)
         risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
     clear = costmap.clearance(local.seen & (local.occupancy > 0), grid.resolution)
+    top, left = _local_corner(spec)
+    near = costmap.pool(_fine_clearance(spec, state.belief), 2, "max")  # what rollouts will find there
+    clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
     retreating = recover.mode == behaviour.RETREAT
     if planner.recovery:
@@ -217,11 +237,12 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
         found = route.solve(
             spec.route, params.route, clear, priced, jnp.where(retreating, 0.0, visits), local.origin,
-            grid.resolution, seen.pose[:2], goal, robot,
+            grid.resolution, seen.pose[:2], goal, robot, state.time < state.squeeze_until,
         )  # fmt: skip
         value, reachable = found.value, found.reachable
+        until = jnp.where(reachable, state.squeeze_until, state.time + params.squeeze_time)
     else:
-        value, reachable = nothing, jnp.asarray(True)
+        value, reachable, until = nothing, jnp.asarray(True), state.squeeze_until
     exposed = risk
     if planner.progress == "straight":
         direct = route.straight(grid.shape, local.origin, grid.resolution, seen.goal)
@@ -229,7 +250,8 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         exposed = jnp.maximum(risk, visits)  # no route that visits could be priced in: they count as exposure
     exposed = exposed if planner.exposure else nothing
     return state._replace(
-        belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, points=points
+        belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, squeeze_until=until,
+        points=points,
     )
 
 
@@ -239,21 +261,22 @@ def _act(
     """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
     pose, twist, time = seen.pose, seen.twist, state.time
-    h, w = grid.shape
-    n = spec.local_cells
-    top, left = (h - n) // 2, (w - n) // 2
+    n, (top, left) = spec.local_cells, _local_corner(spec)
     window = belief.local_map(spec.filter, state.belief)
-    crop = lambda a: a[top : top + n, left : left + n]  # noqa: E731
     corner = window.origin + jnp.asarray([left, top], jnp.float32) * grid.resolution
-    clear = costmap.clearance(crop(window.seen & (window.occupancy > 0)), grid.resolution)
-    local = GridMap(clear, corner, grid.resolution)
-    field = GridMap(costmap.pack_clearance(crop(state.plan), clear), corner, grid.resolution)
+    clear = _fine_clearance(spec, state.belief)
+    local = GridMap(clear, corner, grid.resolution / 2)
+    plan = costmap.repeat(state.plan[top : top + n, left : left + n], 2)
+    field = GridMap(costmap.pack_clearance(plan, clear), corner, grid.resolution / 2)
 
     recover = state.recovery
     heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)
+    squeeze = time < state.squeeze_until
+    narrow = jnp.minimum(params.route.squeeze_margin, params.score.margin)
+    score = params.score._replace(margin=jnp.where(squeeze, narrow, params.score.margin))
     if planner.generates:
         choice = goal_generator.generate(
-            spec.generator, params.score, robot, field, pose, twist, heading_for, state.local_goal,
+            spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
             jnp.asarray(params.hysteresis, jnp.float32),
         )  # fmt: skip
     else:

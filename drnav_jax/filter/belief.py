@@ -50,6 +50,7 @@ class FilterState(NamedTuple):
 
     occupancy: Array  # [H, W] log-odds of being occupied [nat]; 0 where never seen
     seen: Array  # [H, W] bool, observed since the window holds the cell
+    surface: Array  # [H, W, 2] where in an occupied cell its surface lies, x and y from the centre [cells]
     dead_end: Array  # [H, W] log-odds of being a dead end [nat]
     corner: Array  # [2] int32 (row, column) of cell (0, 0) on the odom lattice
 
@@ -61,6 +62,7 @@ def init(spec: FilterSpec, params: FilterParams, xy: Float[Array, "2"]) -> Filte
     return FilterState(
         occupancy=jnp.zeros(shape, jnp.float32),
         seen=jnp.zeros(shape, bool),
+        surface=jnp.zeros((*shape, 2), jnp.float32),
         dead_end=jnp.full(shape, dead_end.prior_log_odds(params.dead_end)),
         corner=geometry.window_corner(xy, spec.grid),
     )
@@ -79,6 +81,7 @@ def move(spec: FilterSpec, params: FilterParams, state: FilterState, xy: Float[A
         return FilterState(
             occupancy=geometry.shift(state.occupancy, by, 0.0),
             seen=geometry.shift(state.seen, by, 0.0),
+            surface=jnp.stack([geometry.shift(state.surface[..., a], by, 0.0) for a in (0, 1)], axis=-1),
             dead_end=geometry.shift(state.dead_end, by, dead_end.prior_log_odds(params.dead_end)),
             corner=corner,
         )
@@ -121,7 +124,7 @@ def observe(
     state = move(spec, params, state, pose[:2])
     origin = geometry.window_origin(state.corner, spec.grid)
     resolution = spec.grid.resolution
-    hit, crossed = occupancy.observed(
+    hit, crossed, within = occupancy.observed(
         params.occupancy,
         spec.grid.shape,
         origin,
@@ -131,10 +134,11 @@ def observe(
         point_valid,
         spec.num_bearings,
     )
+    surface = occupancy.refine(state.surface, state.occupancy, hit, within)
     belief, seen = occupancy.apply(
         params.occupancy, state.occupancy, state.seen, origin, resolution, pose, hit, crossed
     )
-    return state._replace(occupancy=belief, seen=seen), hit | crossed
+    return state._replace(occupancy=belief, seen=seen, surface=surface), hit | crossed
 
 
 @jax.jit

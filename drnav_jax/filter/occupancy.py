@@ -113,10 +113,11 @@ def observed(
     points: Float[Array, "P 3"],
     point_valid: Bool[Array, " P"],
     num_bearings: int = 180,
-) -> tuple[Bool[Array, "H W"], Bool[Array, "H W"]]:
-    """Cells in which a return of this scan lies, and cells that its rays have crossed.
+) -> tuple[Bool[Array, "H W"], Bool[Array, "H W"], Float[Array, "H W 2"]]:
+    """Cells in which a return of this scan lies, cells that its rays have crossed, and where in its cell each return lies.
 
-    Their union is what the scan has seen; no cell is in both.
+    The union of the two masks is what the scan has seen; no cell is in both. The last output is the mean place (x, y) of
+    the returns in a cell relative to its centre [cells], 0 where there is none.
 
     Args:
         params: Sensor model.
@@ -138,7 +139,13 @@ def observed(
     xy = geometry.transform(pose, jnp.where(returned[:, None], points[:, :2], 0.0))
     cell = jax.vmap(geometry.cell_of, (0, None, None))(xy, origin, resolution)
     flat_index = jnp.where(returned & geometry.inside(cell, shape), cell[:, 0] * w + cell[:, 1], h * w)
-    hit = jnp.zeros(h * w, bool).at[flat_index].set(True, mode="drop").reshape(h, w)
+    place_x, place_y = (
+        (xy[:, a] - origin[a]) / resolution - cell[:, 1 - a].astype(jnp.float32) - 0.5 for a in (0, 1)
+    )
+    counted = jnp.stack([jnp.ones_like(place_x), place_x, place_y], axis=-1)
+    total = jnp.zeros((h * w, 3), jnp.float32).at[flat_index].add(counted, mode="drop").reshape(h, w, 3)
+    hit = total[..., 0] > 0
+    within = total[..., 1:] / jnp.maximum(total[..., :1], 1.0)
 
     x, y = geometry.cell_centres(shape, origin, resolution)
     dx, dy = jnp.broadcast_arrays(x - pose[0], y - pose[1])
@@ -151,7 +158,7 @@ def observed(
     index = jnp.clip(place.astype(jnp.int32), 0, num_bearings - 1)
     limit = least.at[index].get(mode="promise_in_bounds")
     limit = jnp.maximum(limit - params.margin * resolution, params.body_radius)
-    return hit, (dx * dx + dy * dy < jnp.square(limit)) & ~hit
+    return hit, (dx * dx + dy * dy < jnp.square(limit)) & ~hit, within
 
 
 @partial(jax.jit, static_argnames="num_bearings")
@@ -184,7 +191,7 @@ def update(
         The new `(occupancy, seen)`.
     """
     h, w = occupancy.shape
-    hit, crossed = observed(params, (h, w), origin, resolution, pose, points, point_valid, num_bearings)
+    hit, crossed, _ = observed(params, (h, w), origin, resolution, pose, points, point_valid, num_bearings)
     return apply(params, occupancy, seen, origin, resolution, pose, hit, crossed)
 
 
@@ -208,3 +215,32 @@ def apply(
     raised = jnp.clip(occupancy + params.hit, params.l_min, params.l_max)
     value = jnp.where(crossed & ~blind, lowered, occupancy)
     return jnp.where(hit, raised, value), seen | hit | crossed
+
+
+def refine(
+    surface: Float[Array, "H W 2"],
+    occupancy: Float[Array, "H W"],
+    hit: Bool[Array, "H W"],
+    within: Float[Array, "H W 2"],
+    rate: float = 0.25,
+) -> Float[Array, "H W 2"]:
+    """Where in its cell the surface lies: a running mean of where returns fell, finer than the cell.
+
+    Args:
+        surface: So far, relative to the cell's centre [cells].
+        occupancy: Log-odds before this scan: a cell that was not held to be occupied starts afresh.
+        hit: Cells with a return in this scan.
+        within: Mean place of these (`observed`).
+        rate: Weight of one scan.
+    """
+    gain = jnp.where(hit, jnp.where(occupancy > 0, rate, 1.0), 0.0)[..., None]
+    return surface + gain * (within - surface)
+
+
+def fine_obstacles(occupied: Bool[Array, "H W"], surface: Float[Array, "H W 2"]) -> Bool[Array, "2H 2W"]:
+    """Obstacles on cells of half the edge: of each occupied cell the quarter in which its surface lies."""
+    h, w = occupied.shape
+    quarter = jnp.arange(2)
+    north = (surface[..., 1] > 0).astype(jnp.int32)[:, None, :, None] == quarter[None, :, None, None]
+    east = (surface[..., 0] > 0).astype(jnp.int32)[:, None, :, None] == quarter[None, None, None, :]
+    return (occupied[:, None, :, None] & north & east).reshape(2 * h, 2 * w)

@@ -23,7 +23,7 @@ from drnav_jax.types import Scalar
 
 CLEARANCE_STEP = 0.005  # [m]
 VALUE_STEP = 0.01  # [m]
-MAX_CLEARANCE = 1.2  # [m] beyond this nobody asks how far the next obstacle is
+MAX_CLEARANCE = 1.0  # [m] beyond this nobody asks how far the next obstacle is
 
 
 class InflationParams(NamedTuple):
@@ -53,6 +53,17 @@ def clearance(occupied: Bool[Array, "H W"], resolution: float) -> Float[Array, "
     The surface itself lies anywhere within that cell: up to 0.7 of a cell nearer. Margins allow for it.
     """
     return grids.distance_transform(occupied, resolution, MAX_CLEARANCE)
+
+
+def pool(values: Array, by: int, reduce: str) -> Array:
+    """Coarser cells: "max", "mean", "any", "all" over blocks of `by` x `by`."""
+    h, w = values.shape
+    return getattr(jnp, reduce)(values.reshape(h // by, by, w // by, by), axis=(1, 3))
+
+
+def repeat(values: Array, by: int) -> Array:
+    """Finer cells: each cell's value on `by` x `by`."""
+    return jnp.repeat(jnp.repeat(values, by, axis=0), by, axis=1)
 
 
 @jax.jit

@@ -2,9 +2,10 @@
 
 Optimistic (unknown = free), on cells `pooling` times as coarse as the map's. A cell's cost per metre is
 
-    1 + w_i inflation / 252 + min(risk_weight * risk, risk_cap) + w_v visits
+    1 + w_o ((d_soft - d) / (d_soft - d_block))_+^2 + min(risk_weight * risk, risk_cap) + w_v visits
 
-so that the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the only way
+with the clearance term of J_geom (`scoring`), so that the value falls along a good path at least as fast as the path's own
+cost grows. Thus the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the only way
 may look like a dead end. A goal outside the window is reached over the window's edge: an edge cell is worth its straight
 distance to the goal. If no way to a goal inside the window is known, edge cells are a last resort.
 """
@@ -19,7 +20,6 @@ from jaxtyping import Array, Bool, Float
 
 from drnav_jax import geometry, grids
 from drnav_jax.planning import costmap
-from drnav_jax.planning.costmap import InflationParams
 from drnav_jax.types import RobotParams, Scalar
 
 
@@ -44,11 +44,10 @@ class RouteSpec:
 class RouteParams(NamedTuple):
     """What the route costs."""
 
-    margin: Scalar = 0.1  # [] beyond the radius: cells with less clearance cost `tight_cost` [m]
-    closed_margin: Scalar = 0.035  # [] beyond the radius: cells with less clearance are closed [m]
-    tight_cost: Scalar = 5.0  # [] per metre, where it is tight
-    inflation_weight: Scalar = 0.5  # [] w_i
-    inflation: InflationParams = InflationParams(scaling=4.0, radius=1.0)
+    closed_margin: Scalar = 0.06  # [] beyond the radius: cells with less clearance are closed [m]
+    squeeze_margin: Scalar = 0.04  # [] the same, once no way was found at `closed_margin` [m]
+    clearance: Scalar = 1.0  # [] w_o
+    soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
     risk_weight: Scalar = 3.0  # [] lambda inside the cell cost
     risk_cap: Scalar = 4.0  # [] most that risk adds to a metre
     visit_weight: Scalar = 4.0  # [] w_v
@@ -61,11 +60,6 @@ class Route(NamedTuple):
 
     value: Float[Array, "H W"]  # [m] on the map's cells; `UNREACHABLE` where there is no way
     reachable: Bool[Array, ""]  # the robot has a way (possibly out of the window) to the goal
-
-
-def _pool(values: Array, by: int, reduce: str) -> Array:
-    h, w = values.shape
-    return getattr(jnp, reduce)(values.reshape(h // by, by, w // by, by), axis=(1, 3))
 
 
 def _sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
@@ -83,7 +77,7 @@ def _sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
 
 def _spread(value: Array, by: int) -> Array:
     """Coarse values on the fine cells: bilinear where all neighbours are reachable, else the cell's own."""
-    own = jnp.repeat(jnp.repeat(value, by, axis=0), by, axis=1)
+    own = costmap.repeat(value, by)
     h, w = value.shape
     padded = jnp.pad(value, 1, mode="edge")
     out = jnp.zeros_like(own).reshape(h, by, w, by)
@@ -112,6 +106,7 @@ def solve(
     xy: Float[Array, "2"],
     goal: Float[Array, "2"],
     robot: RobotParams,
+    squeeze: Bool[Array, ""],
 ) -> Route:
     """The optimistic cost-to-go on the window (module docstring).
 
@@ -126,28 +121,29 @@ def solve(
         xy: Robot [m].
         goal: Where to go [m].
         robot: Its radius.
+        squeeze: Use `squeeze_margin`.
     """
     by, size = spec.pooling, resolution * spec.pooling
-    inscribed = robot.radius + params.margin
     x, y = geometry.cell_centres(clear.shape, origin, resolution)
     near = jnp.hypot(x - xy[0], y - xy[1]) < params.escape_radius
     # closed, unless the robot stands there already or the goal is there
     at_goal = jnp.hypot(x - goal[0], y - goal[1]) <= 1.5 * size
-    free = (clear >= robot.radius + params.closed_margin) | ((near | at_goal) & (clear > 0.5 * robot.radius))
+    closed = robot.radius + jnp.where(squeeze, params.squeeze_margin, params.closed_margin)
+    free = (clear >= closed) | ((near | at_goal) & (clear > 0.5 * robot.radius))
     east, north = _sides(free, by)
-    clear, risk, visits = _pool(clear, by, "max"), _pool(risk, by, "mean"), _pool(visits, by, "mean")
+    clear, risk, visits = (costmap.pool(a, by, "mean") for a in (clear, risk, visits))
     h, w = clear.shape
     x, y = geometry.cell_centres((h, w), origin, size)
     to_goal, to_robot = jnp.hypot(x - goal[0], y - goal[1]), jnp.hypot(x - xy[0], y - xy[1])
-    soft = jnp.minimum(costmap.inflation(clear, inscribed, params.inflation), 252.0) / 252.0
+    slope = 1.0 / jnp.maximum(params.soft_clearance - params.closed_margin, 1e-3)
+    lack = jnp.maximum((robot.radius + params.soft_clearance - clear) * slope, 0.0)
     cost = (
         1.0
-        + params.inflation_weight * soft
+        + params.clearance * lack * lack
         + jnp.minimum(params.risk_weight * risk, params.risk_cap)
         + params.visit_weight * visits
     )
-    cost = jnp.where(clear < inscribed, params.tight_cost, cost)
-    cost = jnp.where(_pool(free, by, "any"), cost, grids.UNREACHABLE)
+    cost = jnp.where(costmap.pool(free, by, "any"), cost, grids.UNREACHABLE)
     row, col = jnp.arange(h)[:, None], jnp.arange(w)[None, :]
     edge = (row == 0) | (row == h - 1) | (col == 0) | (col == w - 1)
     held = geometry.inside(geometry.cell_of(goal, origin, size), (h, w))

@@ -37,7 +37,7 @@ class ScoreParams(NamedTuple):
     """Weights of J_geom and EDE; all may be swept."""
 
     collision: Scalar = 0.1  # [] w_c [m]
-    clearance: Scalar = 0.3  # [] w_o []
+    clearance: Scalar = 1.0  # [] w_o []
     smoothness: Scalar = 0.1  # [] w_y [m/rad]
     range_bias: Scalar = 0.2  # [] w_r []
     progress: Scalar = 1.0  # [] w_p []
@@ -47,7 +47,7 @@ class ScoreParams(NamedTuple):
     least_arc: Scalar = 0.3  # [] a local goal nearer than this is none [m]
     range_max: Scalar = 5.0  # [] endpoints lie no farther than this [m]
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
-    margin: Scalar = 0.035  # [] beyond the radius: closer counts as blocked [m]
+    margin: Scalar = 0.05  # [] beyond the radius: closer counts as blocked [m]
     horizon: Scalar = 4.0  # [] H [s]
 
 

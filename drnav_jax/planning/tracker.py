@@ -55,9 +55,9 @@ class TrackerSpec:
 class TrackerParams(NamedTuple):
     """Weights of the ranking; times in seconds."""
 
-    margin: Scalar = 0.03  # [] beyond the radius: no certified motion comes closer [m]
+    margin: Scalar = 0.04  # [] beyond the radius: no certified motion comes closer [m]
     heading: Scalar = 1.0  # [] w_h
-    clearance: Scalar = 0.5  # [] w_c [s]
+    clearance: Scalar = 1.0  # [] w_c [s]
     soft_clearance: Scalar = 0.3  # [] beyond the radius: where the clearance term begins [m]
     smoothness: Scalar = 0.05  # [] w_s [s]
 

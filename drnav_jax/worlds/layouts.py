@@ -14,7 +14,7 @@ from drnav_jax.worlds.world import WALL_HEIGHT, World, no_field, signed_distance
 
 WAY = 1.2  # [m] width that clutter leaves free along every passage
 WING = 50.0  # [m] of wall to either side of a block
-MOUTH = 4.9  # [m] the widest of a cul-de-sac; wider ones are bays, not dead ends
+MOUTH = 4.9  # [m] the widest of a cul-de-sac; wider or shallower ones are bays, not dead ends
 REAR = 7.0  # [m] of stem or fence behind the start
 
 Rect = tuple[float, float, float, float]  # x_min, y_min, x_max, y_max
@@ -107,13 +107,15 @@ def _open(draw: Draw, rng: np.random.Generator) -> Layout:
 
 def _u(draw: Draw, rng: np.random.Generator) -> Layout:
     ahead, depth, width, behind = (draw(name) for name in ("ahead", "depth", "width", "behind"))
+    depth = max(depth, 1.3 * width)
     behind = max(behind, 15.0 - ahead - depth)
     thickness = rng.uniform(0.2, 0.3)
     shift, goal_y = rng.uniform(-0.25, 0.25) * width, rng.uniform(-1.0, 1.0)
     back = ahead + depth
     low, high = shift - width / 2, shift + width / 2
     spread = [depth * math.tan(math.radians(draw("flare"))) for _ in range(2)]
-    spread = [min(max(s, -0.2 * width), (MOUTH - width) / 2) for s in spread]
+    room = min(MOUTH, depth / 1.25) - width
+    spread = [min(max(s, -0.2 * width), room / 2) for s in spread]
     door = draw("door")
     middle = shift + rng.uniform(-0.5, 0.5) * (width - door - 0.5)
     sides = [
@@ -261,9 +263,9 @@ def clutter(
     def place(x: float, y: float, yaw: float, size: float, free_standing: bool) -> None:
         is_box, height = rng.random() < 0.5, rng.uniform(0.7, 2.0)
         half = size * rng.uniform(0.6, 1.0, 2)
-        reach = math.hypot(*half) if is_box else size
-        if not free_standing and is_box:
-            reach = size  # its side lies along the wall
+        if not free_standing:
+            half[1] = size  # from the wall to the way
+        reach = math.hypot(*half) if is_box and free_standing else size
         centre = np.array([[x, y]])
         ways = layout.ways if free_standing else [line for line, _ in layout.corridors]
         gap = min(_to_polyline(centre, way)[0] for way in ways) - reach

@@ -212,9 +212,9 @@ def _fill_outside(occupied: np.ndarray, resolution: float, gap: float) -> np.nda
     """Walls plus whatever a disc of diameter `gap` [m] sweeps that rolls in from the border."""
     radius = gap / 2 / resolution
     padded = np.pad(occupied, math.ceil(radius) + 2)
-    passable = ndimage.distance_transform_edt(~padded) > radius
+    passable = ndimage.distance_transform_edt(~padded) - 0.5 > radius
     parts, _ = ndimage.label(passable)
-    swept = ndimage.distance_transform_edt(parts != parts[0, 0]) <= radius
+    swept = ndimage.distance_transform_edt(parts != parts[0, 0]) <= radius + 0.5
     cut = math.ceil(radius) + 2
     return occupied | swept[cut:-cut, cut:-cut]
 

@@ -12,6 +12,7 @@ All of it is host code for preparing worlds: nothing here runs inside an episode
 
 import math
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +53,8 @@ class Graph(NamedTuple):
         return ndimage.map_coordinates(self.distance, cell, order=1, mode="nearest")
 
 
-_cache: OrderedDict[tuple, tuple[np.ndarray, Graph]] = OrderedDict()
+# What a graph was built from (the array and the world themselves, so that their ids stay theirs).
+_cache: OrderedDict[tuple, tuple[object, object, np.ndarray, Graph]] = OrderedDict()
 
 
 def _search_grid(occupied: np.ndarray, native: float) -> tuple[tuple[int, int], float]:
@@ -103,21 +105,22 @@ def search_graph(where: Scene | GridMap, clearance: float) -> Graph:
     """The search graph of a scene or an occupancy grid; the last few are kept."""
     if not (math.isfinite(clearance) and clearance >= 0):
         raise ValueError(f"clearance_radius must be finite and >= 0 m, got {clearance}.")
-    occupied = where.occupied if isinstance(where, Scene) else where.values
-    origin = tuple(float(v) for v in where.origin)
-    native = float(where.resolution)
-    key = (id(occupied), origin, native, float(clearance))
-    found = _cache.get(key)
-    if found is not None and found[0] is occupied:
-        _cache.move_to_end(key)
-        return found[1]
+    is_scene = isinstance(where, Scene)
+    occupied, world = (where.occupied, where.world) if is_scene else (where.values, None)
     grid = np.asarray(occupied)
     if grid.ndim != 2 or grid.dtype != bool:
         raise ValueError(f"occupancy must be bool [H, W], got {grid.dtype} {grid.shape}.")
-    world = where.world if isinstance(where, Scene) else from_grid(grid, origin, native)
+    origin = tuple(float(v) for v in where.origin)
+    native = float(where.resolution)
+    key = (id(occupied), id(world), origin, native, float(clearance))
+    found = _cache.get(key)
+    if found is not None and np.array_equal(found[2], grid):  # it may have been written to since
+        _cache.move_to_end(key)
+        return found[3]
     shape, r = _search_grid(grid, native)
-    graph = _build(world, np.array(origin), shape, r, float(clearance))
-    _cache[key] = (occupied, graph)
+    solid = from_grid(grid, origin, native) if world is None else world
+    graph = _build(solid, np.array(origin), shape, r, float(clearance))
+    _cache[key] = (occupied, world, grid.copy(), graph)
     while len(_cache) > CACHED:
         _cache.popitem(last=False)
     return graph
@@ -221,8 +224,8 @@ def trace(previous: np.ndarray, source: int, target: int) -> list[int]:
 
 def shortest_path(
     where: Scene | GridMap,
-    start: tuple[float, float] | np.ndarray,
-    goal: tuple[float, float] | np.ndarray,
+    start: Sequence[float] | np.ndarray,
+    goal: Sequence[float] | np.ndarray,
     clearance_radius: float,
 ) -> tuple[float, np.ndarray] | None:
     """The shortest any-angle path that keeps a clearance to all walls, within 1 % of its length.
@@ -255,7 +258,7 @@ def shortest_path(
 
 
 def trip_cells(
-    path: np.ndarray, origin: tuple[float, float] | np.ndarray, resolution: float
+    path: np.ndarray, origin: Sequence[float] | np.ndarray, resolution: float
 ) -> np.ndarray:
     """Every cell that a polyline passes.
 
