@@ -7,9 +7,11 @@ certified command in a static world; if the map changed its mind, the answer is 
 
 Certified candidates are then rolled out over `sim_time` and ranked by the time still needed from the last free pose,
 
-    J = |g - p| / v_max + w_h |bearing error| / w_max + w_c mean((soft - d)/soft)_+^2 + w_s |omega - omega_0| / w_max
+    J = (|g - p| + w_c sum ((d_soft - d) / (d_soft - d_block))_+^2 ds) / v_max + w_h |bearing error| / w_max
+        + w_r (d_block - d_last)_+ + w_s |omega - omega_0| / w_max
 
-which turns on the spot when the goal is behind, drives arcs when it is not, and needs no case distinction.
+which turns on the spot when the goal is behind, drives arcs when it is not, and needs no case distinction. Clearance is
+paid per metre, and w_c < 1: a price per second would make it worth while to stand still beside an obstacle.
 """
 
 import dataclasses
@@ -24,6 +26,9 @@ from drnav_jax import geometry
 from drnav_jax.planning import dynamics
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.types import Command, GridMap, RobotParams, Scalar
+
+
+DIP = 0.004  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +62,8 @@ class TrackerParams(NamedTuple):
 
     margin: Scalar = 0.04  # [] beyond the radius: no certified motion comes closer [m]
     heading: Scalar = 1.0  # [] w_h
-    clearance: Scalar = 1.0  # [] w_c [s]
+    clearance: Scalar = 0.8  # [] w_c
+    room: Scalar = 100.0  # [] w_r: ending nearer to an obstacle than the margin [s/m]
     soft_clearance: Scalar = 0.3  # [] beyond the radius: where the clearance term begins [m]
     smoothness: Scalar = 0.05  # [] w_s [s]
 
@@ -138,11 +144,14 @@ def track(
         return (m, jnp.minimum(least, near)), None
 
     (end, least), _ = jax.lax.scan(brake, drive(start), None, length=spec.brake_ticks)
-    block = jnp.minimum(robot.radius + params.margin, here)
+    # who stands closer than the margin may go, if that leads away; a dip of DIP is noise of the map
+    limit = robot.radius + params.margin
+    block = jnp.minimum(limit, here - DIP)
     still = (v == 0) & (w == 0)
-    certified = ((least >= block) & (jnp.abs(end.v) < 1e-3)) | still
+    certified = ((least >= block) & (room(end) >= jnp.minimum(limit, here)) & (jnp.abs(end.v) < 1e-3)) | still
 
     soft = robot.radius + params.soft_clearance
+    slope = 1.0 / jnp.maximum(params.soft_clearance - params.margin, 1e-3)
 
     def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
         m, lack, free = carry
@@ -150,7 +159,7 @@ def track(
         near = room(ahead)
         free = free & (near >= block)
         m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
-        return (m, lack + jnp.square(jnp.clip((soft - near) / soft, 0.0, 1.0)), free), None
+        return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(v) * dt, free), None
 
     carry = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
     (last, lack, _), _ = jax.lax.scan(roll, carry, None, length=spec.num_steps)
@@ -158,9 +167,9 @@ def track(
     distance = jnp.hypot(dx, dy)
     bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))
     cost = (
-        distance / robot.v_max
+        (distance + params.clearance * lack) / robot.v_max
         + params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0)
-        + params.clearance * lack / spec.num_steps
+        + params.room * jnp.maximum(limit - room(last), 0.0)
         + params.smoothness * jnp.abs(w - w0) / robot.w_max
     )
     cost = jnp.where(seek_room, -room(last), cost)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drnav_jax.worlds.world import WALL_HEIGHT, World, no_field, signed_distance
+from drnav_jax.worlds.world import WALL_HEIGHT, World, make_world, signed_distance
 
 WAY = 1.2  # [m] width that clutter leaves free along every passage
 WING = 50.0  # [m] of wall to either side of a block
@@ -244,11 +244,7 @@ def _to_polyline(points: np.ndarray, line: np.ndarray) -> np.ndarray:
 def world_of(boxes: list[np.ndarray], cylinders: list[np.ndarray]) -> World:
     """Boxes x, y, yaw, half length, half width (, height) and cylinders x, y, radius, height."""
     rows = [[*b[:5], 0.0, b[5] if len(b) > 5 else WALL_HEIGHT] for b in boxes]
-    return World(
-        boxes=np.array(rows, np.float32).reshape(-1, 7),
-        cylinders=np.array([[*c[:3], 0.0, c[3]] for c in cylinders], np.float32).reshape(-1, 5),
-        field=no_field(),
-    )
+    return make_world(rows, [[*c[:3], 0.0, c[3]] for c in cylinders])
 
 
 def clutter(

@@ -208,15 +208,23 @@ def load_map_server(path: str | os.PathLike) -> Scene:
     return map_scene(Path(path).stem, occupied, origin, resolution)
 
 
-def _fill_outside(occupied: np.ndarray, resolution: float, gap: float) -> np.ndarray:
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Distance [cells] of each cell of a mask to the nearest cell that is not in it."""
+    return np.asarray(ndimage.distance_transform_edt(mask))
+
+
+def _fill_outside(occupied: np.ndarray, resolution: float, gap: float, where: str) -> np.ndarray:
     """Walls plus whatever a disc of diameter `gap` [m] sweeps that rolls in from the border."""
     radius = gap / 2 / resolution
-    padded = np.pad(occupied, math.ceil(radius) + 2)
-    passable = ndimage.distance_transform_edt(~padded) - 0.5 > radius
-    parts, _ = ndimage.label(passable)
-    swept = ndimage.distance_transform_edt(parts != parts[0, 0]) <= radius + 0.5
-    cut = math.ceil(radius) + 2
-    return occupied | swept[cut:-cut, cut:-cut]
+    ring = math.ceil(radius) + 2
+    passable = _distance(~np.pad(occupied, ring)) - 0.5 > radius
+    # The padding is one part with number 1, as the label of the first cell met.
+    parts = np.empty(passable.shape, np.int32)
+    ndimage.label(passable, output=parts)
+    if parts.max() < 2:
+        raise ValueError(f"{where}: gaps wider than {gap} m let the outside in; widen that.")
+    swept = _distance(parts != 1) <= radius + 0.5
+    return occupied | swept[ring:-ring, ring:-ring]
 
 
 def load_floor_plan(
@@ -241,6 +249,5 @@ def load_floor_plan(
         gap = read_number(outside_gap, str(path), "outside_gap")
         if gap <= 0:
             raise ValueError(f"{path}: outside_gap must be > 0 m, got {outside_gap}.")
-        occupied = _fill_outside(occupied, resolution, gap)
-        need_free(occupied, str(path), f"gaps wider than {gap} m let the outside in; widen that.")
+        occupied = _fill_outside(occupied, resolution, gap, str(path))
     return map_scene(Path(path).stem, occupied, (0.0, 0.0), resolution)

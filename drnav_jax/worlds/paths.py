@@ -110,7 +110,7 @@ def search_graph(where: Scene | GridMap, clearance: float) -> Graph:
     grid = np.asarray(occupied)
     if grid.ndim != 2 or grid.dtype != bool:
         raise ValueError(f"occupancy must be bool [H, W], got {grid.dtype} {grid.shape}.")
-    origin = tuple(float(v) for v in where.origin)
+    origin = (float(where.origin[0]), float(where.origin[1]))
     native = float(where.resolution)
     key = (id(occupied), id(world), origin, native, float(clearance))
     found = _cache.get(key)

@@ -5,7 +5,8 @@ name, its ground-truth occupancy grid, a start and a goal, on the host.
 """
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -56,12 +57,28 @@ class Scene:
     outside_is_free: bool = True
 
 
+def _float32(values: Any) -> Any:
+    """Host values as NumPy float32; `Any`, since containers declare their fields for JAX's arrays."""
+    return np.asarray(values, np.float32)
+
+
 def no_field() -> GridMap:
     """The field of a world that is made of boxes and cylinders only."""
     return GridMap(
-        values=np.zeros((0, 0), np.float32),
-        origin=np.zeros(2, np.float32),
-        resolution=np.asarray(1.0, np.float32),
+        values=_float32(np.zeros((0, 0))), origin=_float32([0, 0]), resolution=_float32(1)
+    )
+
+
+def make_world(
+    boxes: Sequence | np.ndarray = (),
+    cylinders: Sequence | np.ndarray = (),
+    field: GridMap | None = None,
+) -> World:
+    """A world on the host (NumPy, float32) out of rows as `World` has them."""
+    return World(
+        boxes=_float32(np.reshape(np.asarray(boxes, np.float32), (-1, 7))),
+        cylinders=_float32(np.reshape(np.asarray(cylinders, np.float32), (-1, 5))),
+        field=no_field() if field is None else field,
     )
 
 
@@ -73,21 +90,19 @@ def distance_field(occupied: np.ndarray, resolution: float) -> np.ndarray:
     """
     if not occupied.any():
         return np.full(occupied.shape, FAR, np.float32)
-    outside = ndimage.distance_transform_edt(~occupied) - 0.5
-    inside = ndimage.distance_transform_edt(occupied) - 0.5
+    outside = np.asarray(ndimage.distance_transform_edt(~occupied)) - 0.5
+    inside = np.asarray(ndimage.distance_transform_edt(occupied)) - 0.5
     return (np.where(occupied, -inside, outside) * resolution).astype(np.float32)
 
 
 def from_grid(occupied: np.ndarray, origin: tuple[float, float], resolution: float) -> World:
     """The world of an occupancy grid: its walls extruded to `WALL_HEIGHT`, as a distance field."""
     field = GridMap(
-        values=distance_field(occupied, resolution),
-        origin=np.asarray(origin, np.float32),
-        resolution=np.asarray(resolution, np.float32),
+        values=_float32(distance_field(occupied, resolution)),
+        origin=_float32(origin),
+        resolution=_float32(resolution),
     )
-    return World(
-        boxes=np.zeros((0, 7), np.float32), cylinders=np.zeros((0, 5), np.float32), field=field
-    )
+    return make_world(field=field)
 
 
 def rasterise(
@@ -149,7 +164,7 @@ def stack_worlds(worlds: list[World]) -> World:
     if not worlds:
         raise ValueError("stack_worlds needs at least one world.")
 
-    def rows(name: str, width: int) -> np.ndarray:
+    def rows(name: str, width: int) -> Any:
         count = max(len(getattr(w, name)) for w in worlds)
         out = np.zeros((len(worlds), count, width), np.float32)
         out[..., :2] = FAR
@@ -169,8 +184,8 @@ def stack_worlds(worlds: list[World]) -> World:
         boxes=rows("boxes", 7),
         cylinders=rows("cylinders", 5),
         field=GridMap(
-            values=np.stack(fields),
-            origin=np.stack([np.asarray(x.field.origin, np.float32) for x in worlds]),
-            resolution=np.stack([np.asarray(x.field.resolution, np.float32) for x in worlds]),
+            values=_float32(fields),
+            origin=_float32([x.field.origin for x in worlds]),
+            resolution=_float32([x.field.resolution for x in worlds]),
         ),
     )

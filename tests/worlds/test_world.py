@@ -8,19 +8,12 @@ from drnav_jax.worlds import (
     World,
     distance_field,
     from_grid,
+    make_world,
     no_field,
     rasterise,
     signed_distance,
     stack_worlds,
 )
-
-
-def world_of(boxes=(), cylinders=()):
-    return World(
-        boxes=np.array(boxes, np.float32).reshape(-1, 7),
-        cylinders=np.array(cylinders, np.float32).reshape(-1, 5),
-        field=no_field(),
-    )
 
 
 def test_distance_field_is_zero_at_the_edge_between_cells():
@@ -41,7 +34,7 @@ def test_a_free_grid_is_far_from_everything():
     radius=st.floats(0.1, 1.5),
 )
 def test_signed_distance_agrees_with_points_on_the_surface(yaw, size, radius):
-    world = world_of([[0.5, -0.3, yaw, *size, 0, 2]], [[2.5, 1.0, radius, 0, 1]])
+    world = make_world([[0.5, -0.3, yaw, *size, 0, 2]], [[2.5, 1.0, radius, 0, 1]])
     points = np.random.default_rng(0).uniform(-4, 4, (60, 2))
     t = np.linspace(-1, 1, 2001)
     one = np.ones_like(t)
@@ -81,11 +74,11 @@ def test_signed_distance_interpolates_a_map():
 
 
 def test_an_empty_world_is_far_away():
-    assert signed_distance(world_of(), np.zeros((2, 2))).tolist() == [FAR, FAR]
+    assert signed_distance(make_world(), np.zeros((2, 2))).tolist() == [FAR, FAR]
 
 
 def test_rasterise_agrees_with_the_distance_at_cell_centres():
-    world = world_of([[1, 2, 0.4, 0.8, 0.3, 0, 2]], [[2.2, 1.1, 0.35, 0, 1]])
+    world = make_world([[1, 2, 0.4, 0.8, 0.3, 0, 2]], [[2.2, 1.1, 0.35, 0, 1]])
     occupied = rasterise(world, (-0.5, 0.2), (30, 40), 0.1)
     y, x = np.mgrid[:30, :40]
     centres = np.stack([-0.5 + (x + 0.5) * 0.1, 0.2 + (y + 0.5) * 0.1], -1).reshape(-1, 2)
@@ -94,8 +87,8 @@ def test_rasterise_agrees_with_the_distance_at_cell_centres():
 
 def test_stacked_worlds_meet_nothing_new():
     worlds = [
-        world_of([[0, 0, 0, 1, 1, 0, 2]], [[3, 3, 0.5, 0, 1]] * 2),
-        world_of([[1, 0, 0, 1, 1, 0, 2]] * 3),
+        make_world([[0, 0, 0, 1, 1, 0, 2]], [[3, 3, 0.5, 0, 1]] * 2),
+        make_world([[1, 0, 0, 1, 1, 0, 2]] * 3),
     ]
     batch = stack_worlds(worlds)
     assert batch.boxes.shape == (2, 3, 7) and batch.cylinders.shape == (2, 2, 5)
@@ -119,4 +112,4 @@ def test_stack_worlds_says_what_does_not_batch():
     with pytest.raises(ValueError, match="at least one"):
         stack_worlds([])
     with pytest.raises(ValueError, match="run them separately"):
-        stack_worlds([world_of(), from_grid(np.eye(3, dtype=bool), (0.0, 0.0), 0.1)])
+        stack_worlds([make_world(), from_grid(np.eye(3, dtype=bool), (0.0, 0.0), 0.1)])
