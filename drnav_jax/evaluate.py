@@ -150,7 +150,7 @@ def label_map(trip: Trip, radius: float) -> GridMap:
     if resolution < LABEL_RESOLUTION - 1e-6:
         shape = tuple(int(n * resolution / LABEL_RESOLUTION) for n in occupied.shape)
         centres = [((np.arange(n) + 0.5) * LABEL_RESOLUTION / resolution - 0.5) for n in shape]
-        fine = worlds.signed_distance(occupied, resolution)
+        fine = worlds.distance_field(occupied, resolution)
         field = ndimage.map_coordinates(fine, np.meshgrid(*centres, indexing="ij"), order=1, mode="nearest")
         occupied, resolution = field <= 0, LABEL_RESOLUTION
     cells = worlds.trip_cells(trip.path, scene.origin, resolution)

@@ -151,7 +151,7 @@ def generate(
     terms = scoring.explain(
         field, scoring.at(chosen_from, index), params, robot, dt=spec.dt, num_steps=spec.num_steps
     )
-    valid = (best.score[0] < BLOCKED) & (best.arc[0] >= jnp.minimum(params.least_arc, jnp.hypot(*(goal - pose[:2]))))
+    valid = best.score[0] < BLOCKED
     return LocalGoal(
         xy=jnp.where(valid, jnp.stack([best.x[0], best.y[0]]), pose[:2]),
         valid=valid, score=best.score[0], exposure=best.exposure[0], geometric=best.geometric[0],

@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from drnav_jax import geometry, grids
 from drnav_jax.planning import costmap
-from drnav_jax.types import RobotParams, Scalar
+from drnav_jax.types import GridMap, RobotParams, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ class RouteParams(NamedTuple):
     risk_weight: Scalar = 3.0  # [] lambda inside the cell cost
     risk_cap: Scalar = 4.0  # [] most that risk adds to a metre
     visit_weight: Scalar = 4.0  # [] w_v
-    escape_radius: Scalar = 0.6  # [] a robot that stands too close may pass closed cells this near [m]
+    escape_radius: Scalar = 0.6  # [] a robot that stands on a closed cell may pass such this near [m]
     lost_penalty: Scalar = 100.0  # [] added to leaving the window when the goal is inside it [m]
 
 
@@ -129,7 +129,9 @@ def solve(
     # closed, unless the robot stands there already or the goal is there
     at_goal = jnp.hypot(x - goal[0], y - goal[1]) <= 1.5 * size
     closed = robot.radius + jnp.where(squeeze, params.squeeze_margin, params.closed_margin)
-    free = (clear >= closed) | ((near | at_goal) & (clear > 0.5 * robot.radius))
+    here = geometry.sample_nearest(GridMap(clear, origin, resolution), xy)
+    leave = near & (here < closed) & (clear >= here - resolution)
+    free = (clear >= closed) | leave | (at_goal & (clear > 0.5 * robot.radius))
     east, north = _sides(free, by)
     clear, risk, visits = (costmap.pool(a, by, "mean") for a in (clear, risk, visits))
     h, w = clear.shape

@@ -39,12 +39,12 @@ class ScoreParams(NamedTuple):
     collision: Scalar = 0.1  # [] w_c [m]
     clearance: Scalar = 1.0  # [] w_o []
     smoothness: Scalar = 0.1  # [] w_y [m/rad]
-    range_bias: Scalar = 0.2  # [] w_r []
+    range_bias: Scalar = 0.5  # [] w_r []
     progress: Scalar = 1.0  # [] w_p []
     risk_weight: Scalar = 3.0  # [] lambda of eq. 1 and 7 [m/m]
     decay: Scalar = 0.1  # [] lambda of w_k = exp(-lambda s_k) [1/m]
     range_min: Scalar = 3.0  # [] endpoints nearer than this pay the range bias [m]
-    least_arc: Scalar = 0.3  # [] a local goal nearer than this is none [m]
+    range_least: Scalar = 0.3  # [] shorter prefixes are no candidates [m]
     range_max: Scalar = 5.0  # [] endpoints lie no farther than this [m]
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
     margin: Scalar = 0.05  # [] beyond the radius: closer counts as blocked [m]
@@ -126,7 +126,7 @@ def _score_block(
             + params.range_bias * jnp.maximum(params.range_min - arc, 0.0)
         )
         score = geometric + params.risk_weight * risk_sum
-        better = alive & (score < best[0]) & (k * dt <= params.horizon)
+        better = alive & (score < best[0]) & (arc >= params.range_least) & (k * dt <= params.horizon)
         now = (score, m.x, m.y, arc, geometric, risk_sum, cost, turned, value)
         best = tuple(jnp.where(better, a, b) for a, b in zip(now, best, strict=True))
         return (m, arc, cost, risk_sum, turned, alive, hit, best), None
