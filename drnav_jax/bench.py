@@ -1,17 +1,36 @@
-"""Times of the parts next to their rivals, measured in turn within one run."""
+"""Times of the parts next to their rivals, measured in turn within one run.
+
+What is timed: the robot's whole tick on a recorded drive, the scoring of candidates in the field of that drive, the LiDAR
+against native MuJoCo, and batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from slow code.
+"""
 
 import importlib
+import os
+import platform
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax.sim import LidarParams, LidarSpec, cast
+from drnav_jax import evaluate, geometry, navigator, worlds
+from drnav_jax.evaluate import Setup
+from drnav_jax.navigator import NavParams, NavSpec, NavState
+from drnav_jax.planning import costmap, goal_generator, scoring
+from drnav_jax.planning.goal_generator import GeneratorSpec
+from drnav_jax.sim import LidarParams, LidarSpec, cast, episode, kinematic, scan
+from drnav_jax.sim.episode import EpisodeSpec
+from drnav_jax.types import GridMap, Observation, empty_observation
 from drnav_jax.worlds.world import World, no_field
+
+DRIVE = "t"  # family whose world is driven for the recording: corridors, a fork, a dead end
+FAMILIES = ("u", "t", "l", "corridor", "open")  # of the batched episodes, in turn
+NUM_STEPS = 56  # T of the scoring
+PACE = 0.3  # [m/s] limit of the batched episodes, so that none arrives within its 600 steps
 
 
 def _interleaved(calls: list[Callable[[], object]], repeats: int) -> list[float]:
@@ -150,3 +169,244 @@ def lidar_against_mujoco(
         "max_error_m": float(np.max(np.abs(ranges[both] - expected[both]), initial=0.0)),
         "mismatches": float(np.sum(np.isfinite(ranges) != np.isfinite(expected))),
     }
+
+
+class Drive(NamedTuple):
+    """A recorded drive: what the robot was, what it sensed at each tick, and what it knew after the last."""
+
+    spec: NavSpec
+    params: NavParams
+    observations: list[Observation]
+    begin: NavState
+    end: NavState
+
+
+def record(num_ticks: int, num_candidates: int = 4096, seed: int = 0) -> Drive:
+    """Drive through a world of `DRIVE` in closed loop and keep what was sensed.
+
+    Args:
+        num_ticks: Ticks to drive; it ends sooner if the robot arrives.
+        num_candidates: Candidates of the goal generator.
+        seed: Of the world and of the sensor's noise.
+    """
+    scene = worlds.sample(DRIVE, seed)
+    assert scene.start is not None and scene.goal is not None
+    setup = Setup(num_candidates=num_candidates, seed=seed)
+    spec = evaluate.spec_of(setup.planner, setup.predictor, num_candidates)
+    params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), evaluate.params_of(setup))
+    lidar, beams = LidarParams(max_range=setup.lidar_range), LidarSpec()
+    pose, twist = jnp.asarray(scene.start, jnp.float32), jnp.zeros(2, jnp.float32)
+    goal = jnp.asarray(scene.goal, jnp.float32)
+    keys = jax.random.split(jax.random.key(seed), num_ticks)
+    state = begin = navigator.init(spec, params, pose)
+    observations = []
+    for k in range(num_ticks):
+        points, valid = scan(beams, lidar, scene.world, pose, keys[k])
+        seen = empty_observation(points.shape[0])._replace(
+            points=points, point_valid=valid, pose=pose, twist=twist, goal=goal
+        )
+        observations.append(seen)
+        state, command, info = navigator.step(spec, params, state, seen, keys[k], replan=k % spec.replan_every == 0)
+        if info.arrived:
+            break
+        pose, twist = kinematic.step(params.robot, pose, twist, command, spec.dt)
+    return Drive(spec, params, observations, begin, state)
+
+
+def tick_times(drive: Drive, warm_up: int = 20) -> dict[str, float]:
+    """Times [ms] of `navigator.step` on a recorded drive, ticks that replan included; the state is carried along.
+
+    Args:
+        drive: From `record`.
+        warm_up: First ticks that do not count.
+    """
+    state, key, every = drive.begin, jax.random.key(0), drive.spec.replan_every
+    spent = []
+    for k, seen in enumerate(drive.observations):
+        begin = time.perf_counter()
+        state, command, _ = navigator.step(drive.spec, drive.params, state, seen, key, replan=k % every == 0)
+        jax.block_until_ready((state, command))
+        spent.append(1e3 * (time.perf_counter() - begin))
+    counted, replans = np.asarray(spent[warm_up:]), np.arange(warm_up, len(spent)) % every == 0
+    return {
+        "median": float(np.median(counted)),
+        "p95": float(np.percentile(counted, 95)),
+        "max": float(np.max(counted)),
+        "replan_median": float(np.median(counted[replans])),
+        "replan_p95": float(np.percentile(counted[replans], 95)),
+        "ticks": len(counted),
+    }
+
+
+def _candidates(drive: Drive, num: int) -> scoring.Candidates:
+    """`num` candidates of a moving robot where the drive ended."""
+    speeds = 16 if num <= 4096 else 64
+    spec = GeneratorSpec(num_speeds=speeds, num_turns=(num - 256) // speeds, num_headings=256)
+    seen, params = drive.observations[-1], drive.params
+    twist = jnp.asarray([0.6, 0.4], jnp.float32)
+    return goal_generator.candidates(
+        spec, params.score, params.robot, seen.pose, twist, seen.goal, drive.end.local_goal, params.hysteresis
+    )
+
+
+def _bilinear(layers: tuple[GridMap, GridMap, GridMap], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+    """What `scoring.look_up` reads, from float layers and between the cells' centres."""
+    xy = jnp.stack([x, y], axis=-1)
+    clear, risk, value = layers
+    # beside closed cells nothing can be interpolated
+    smooth, own = geometry.sample_bilinear(value, xy), geometry.sample_nearest(value, xy)
+    return (
+        geometry.sample_bilinear(clear, xy), geometry.sample_bilinear(risk, xy),
+        jnp.where(jnp.abs(smooth - own) < 2 * value.resolution, smooth, own),
+    )  # fmt: skip
+
+
+def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[str, float], float]:
+    """Candidate-steps per second of `scoring.score`, its error, and the time of the reference matmul [ms].
+
+    T = `NUM_STEPS` steps of 0.1 s, risk and obstacle cost, limited in acceleration from a moving state, in the field that
+    the navigator makes. The error is that of nearest packed look-ups against bilinear look-ups in float, over the
+    candidates that are free in both: of the score, relative to the way it counts (score less the least value).
+    """
+    local, field = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, drive.end)
+    params = drive.params.score._replace(horizon=jnp.asarray(0.1 * NUM_STEPS, jnp.float32))
+    robot = drive.params.robot
+
+    def scores(num: int, **how: Any) -> Callable[[], scoring.Scores]:
+        chosen = _candidates(drive, num)
+        layers = how.pop("layers", field)
+        return lambda: scoring.score(layers, chosen, params, robot, dt=0.1, num_steps=NUM_STEPS, **how)
+
+    square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
+    matmul = jax.jit(lambda a: a @ a)
+    counts = (4096, 65536)
+    *seconds, reference = _interleaved([*(scores(n) for n in counts), lambda: matmul(square)], repeats)
+    rates = {str(n): n * NUM_STEPS / s for n, s in zip(counts, seconds, strict=True)}
+
+    window = geometry.window_origin(drive.end.belief.corner, drive.spec.filter.grid)
+    cell = drive.spec.filter.grid.resolution
+    value = costmap.unpack(drive.end.plan)[2]
+    layers = (local, GridMap(drive.end.risk, window, cell), GridMap(value, window, cell))
+    ours, smooth = scores(4096)(), scores(4096, layers=layers, reader=_bilinear)()
+    return rates, _difference(ours, smooth), 1e3 * reference
+
+
+def _difference(ours: scoring.Scores, smooth: scoring.Scores) -> dict[str, float]:
+    """How two scores of the same candidates differ; ranks are counted from 0."""
+    a, b = np.asarray(ours.score, float), np.asarray(smooth.score, float)
+    both = (a < scoring.BLOCKED) & (b < scoring.BLOCKED)
+    error = np.abs(a[both] - b[both])
+    relative = error / np.maximum(np.abs(b[both]), 1e-3)
+    best = int(np.argmin(a))
+    return {
+        "median_relative": float(np.median(relative)),
+        "p95_relative": float(np.percentile(relative, 95)),
+        "median_m": float(np.median(error)),
+        "p95_m": float(np.percentile(error, 95)),
+        "rank_of_best": float(np.sum(b < b[best])),
+        "regret_m": float(b[best] - np.min(b)),
+        "blocked_in_one_only": float(np.mean((a < scoring.BLOCKED) != (b < scoring.BLOCKED))),
+        "candidates": float(np.sum(both)),
+    }
+
+
+def episode_rate(
+    batch: int = 16, num_steps: int = 600, *, spec: EpisodeSpec = EpisodeSpec(), workers: int = 2  # noqa: B008 (immutable)
+) -> tuple[float, dict[str, int]]:
+    """Closed-loop episodes of 600 steps per second, in one batched call after compilation.
+
+    Geometric predictor, 1,024 candidates, worlds of all `FAMILIES` in turn. The robots are so slow (`PACE`) that they are
+    among the obstacles all the time and none arrives.
+
+    Args:
+        batch: Episodes.
+        num_steps: Steps of each.
+        spec: Sizes of the simulation.
+        workers: Threads that share the batch.
+
+    Returns:
+        Episodes per second (steps driven / 600 / time), and what was run.
+    """
+    scenes = [worlds.sample(FAMILIES[k % len(FAMILIES)], k // len(FAMILIES)) for k in range(batch)]
+    setup = Setup(max_speed=PACE, time_limit=num_steps * spec.dt)
+    policy = evaluate.policy_of(evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates))
+    params = evaluate.episode_params(evaluate.prepare(scenes, setup), setup)
+    keys = jax.random.split(jax.random.key(0), batch)
+    short = params._replace(time_limit=np.full_like(params.time_limit, spec.dt))
+    episode.run(spec, policy, short, keys, workers=workers)  # compiles
+    begin = time.perf_counter()
+    result = episode.run(spec, policy, params, keys, workers=workers)
+    wall = time.perf_counter() - begin
+    steps = int(result.log.active.sum())
+    how = {"batch": batch, "steps": steps, "lanes": spec.lanes, "workers": workers}
+    return steps / 600 / wall, how
+
+
+def machine() -> dict[str, Any]:
+    """What this was measured on."""
+    info = Path("/proc/cpuinfo")
+    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] if (
+        info.exists()
+    ) else []
+    return {
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cpu": names[0] if names else platform.processor() or platform.machine(),
+        "platform": platform.platform(),
+        "device": jax.default_backend(),
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def run(*, quick: bool = False) -> dict[str, Any]:
+    """All of it.
+
+    Args:
+        quick: Few repeats and short episodes: the same keys in less time, figures that mean little.
+
+    Returns:
+        `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `lidar`,
+        `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
+    """
+    warm_up = 5 if quick else 20
+    drive = record(30 if quick else warm_up + 200)
+    tick = tick_times(drive, warm_up)
+    rates, error, reference = scoring_times(drive, 3 if quick else 50)
+    lidar = lidar_against_mujoco(repeats=3 if quick else 30)
+    per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
+    return {
+        "tick_lidar_ms": tick, "scoring": rates, "scoring_error": error, "lidar": lidar, "episodes_per_s": per_second,
+        "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
+    }  # fmt: skip
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result of `run` for people."""
+    tick, error, lidar, episodes = (result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "episodes"))
+    rows = [
+        ("tick, 4,096 candidates", f"{tick['median']:.1f} ms median, {tick['p95']:.1f} p95, {tick['max']:.1f} max"),
+        ("tick that replans", f"{tick['replan_median']:.1f} ms median, {tick['replan_p95']:.1f} p95"),
+        *(
+            (f"scoring, {int(n):,} x {NUM_STEPS}", f"{rate / 1e6:.0f} M candidate-steps/s")
+            for n, rate in result["scoring"].items()
+        ),
+        (
+            "  against bilinear",
+            f"{100 * error['median_relative']:.2f} % median, {100 * error['p95_relative']:.2f} % p95; "
+            f"its best costs {100 * error['regret_m']:.1f} cm more",
+        ),
+        (
+            "LiDAR 16x360, 100 obstacles",
+            f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo, "
+            f"max error {lidar['max_error_m']:.1e} m",
+        ),
+        (
+            "episodes of 600 steps",
+            f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call, {episodes['lanes']} lanes, "
+            f"{episodes['workers']} workers)",
+        ),
+        ("matmul 1024^3 float32", f"{result['reference_matmul_ms']:.1f} ms"),
+        ("machine", "{cores} x {cpu}, {device}, jax {jax}, python {python}".format(**result["machine"])),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {text}" for name, text in rows)

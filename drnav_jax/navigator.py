@@ -207,6 +207,18 @@ def _fine_clearance(spec: NavSpec, held: FilterState) -> Float[Array, "n n"]:
     return costmap.clearance(fine, spec.filter.grid.resolution / 2)
 
 
+def rollout_field(spec: NavSpec, state: NavState) -> tuple[GridMap, GridMap]:
+    """The square around the robot on cells of half the map's edge: clearance [m], and the words that rollouts read."""
+    n, (top, left) = spec.local_cells, _local_corner(spec)
+    resolution = spec.filter.grid.resolution
+    origin = geometry.window_origin(state.belief.corner, spec.filter.grid)
+    corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
+    clear = _fine_clearance(spec, state.belief)
+    plan = costmap.repeat(state.plan[top : top + n, left : left + n], 2)
+    words = costmap.pack_clearance(plan, clear)
+    return GridMap(clear, corner, resolution / 2), GridMap(words, corner, resolution / 2)
+
+
 def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation) -> NavState:
     """Evidence -> belief -> risk; recovery points; cost-to-go."""
     grid, planner, robot = spec.filter.grid, spec.planner, params.robot
@@ -261,13 +273,8 @@ def _act(
     """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
     pose, twist, time = seen.pose, seen.twist, state.time
-    n, (top, left) = spec.local_cells, _local_corner(spec)
     window = belief.local_map(spec.filter, state.belief)
-    corner = window.origin + jnp.asarray([left, top], jnp.float32) * grid.resolution
-    clear = _fine_clearance(spec, state.belief)
-    local = GridMap(clear, corner, grid.resolution / 2)
-    plan = costmap.repeat(state.plan[top : top + n, left : left + n], 2)
-    field = GridMap(costmap.pack_clearance(plan, clear), corner, grid.resolution / 2)
+    local, field = rollout_field(spec, state)
 
     recover = state.recovery
     heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)

@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-Scalar: TypeAlias = float | Array
+Scalar: TypeAlias = int | float | Array
 
 
 @dataclasses.dataclass(frozen=True)

@@ -237,7 +237,7 @@ def refine(
     return surface + gain * (within - surface)
 
 
-def fine_obstacles(occupied: Bool[Array, "H W"], surface: Float[Array, "H W 2"]) -> Bool[Array, "2H 2W"]:
+def fine_obstacles(occupied: Bool[Array, "H W"], surface: Float[Array, "H W 2"]) -> Bool[Array, "2*H 2*W"]:
     """Obstacles on cells of half the edge: of each occupied cell the quarter in which its surface lies."""
     h, w = occupied.shape
     quarter = jnp.arange(2)

@@ -80,7 +80,7 @@ def predict(params: GeometricParams, observation: Observation, local_map: LocalM
     closed = passable & ~open_
     verdict = free & (to_robot <= params.range) & (to_robot > params.body)
     well_seen = jnp.clip(_box_mean(seen.astype(jnp.float32), 3) / params.seen_share, 0.0, 1.0)
-    confidence = jnp.where(closed, 1.0, params.open_confidence) * well_seen * verdict
+    confidence = jnp.where(verdict, jnp.where(closed, 1.0, params.open_confidence) * well_seen, 0.0)
     p_dead = jnp.where(closed, params.p_dead, params.p_open).astype(jnp.float32)
     spread = lambda a: jnp.repeat(jnp.repeat(a, by, axis=0), by, axis=1)  # noqa: E731
     return Evidence(p_dead=spread(p_dead), confidence=spread(confidence))

@@ -18,8 +18,9 @@ structure of `[K]` arrays carried by a scan, no trigonometry is evaluated inside
 that stay in the cache, so memory is flat in K.
 """
 
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -85,8 +86,12 @@ class Terms(NamedTuple):
     bias: Array
 
 
-def _look_up(field: GridMap, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Clearance, risk, value of the cells under (x, y); beyond the edge the edge's."""
+_Each = TypeVar("_Each", Candidates, Scores, Terms)
+Reader = Callable[[Array, Array], tuple[Array, Array, Array]]  # (x, y) -> clearance, risk, value
+
+
+def look_up(field: GridMap, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Clearance [m], risk and value [m] of the cells under (x, y), out of packed words; beyond the edge the edge's."""
     h, w = field.values.shape
     inv = 1.0 / field.resolution
     col = jnp.clip((x - field.origin[0]) * inv, 0.0, w - 1.0).astype(jnp.int32)
@@ -95,7 +100,7 @@ def _look_up(field: GridMap, x: Array, y: Array) -> tuple[Array, Array, Array]:
 
 
 def _score_block(
-    field: GridMap, start: Candidates, params: ScoreParams, robot: RobotParams, block: Array, dt: float, num_steps: int
+    read: Reader, start: Candidates, params: ScoreParams, robot: RobotParams, block: Array, dt: float, num_steps: int
 ) -> tuple[Scores, Terms]:
     """Scores of the candidates of one block (module docstring)."""
     dv, dw = robot.a_max * dt, robot.alpha_max * dt
@@ -110,7 +115,7 @@ def _score_block(
         c, s = rotate(m.c, m.s, (0.5 * dt) * (m.w + w))  # heading at the middle of the step
         ds = jnp.abs(v) * dt
         m = Motion(x=m.x + v * dt * c, y=m.y + v * dt * s, c=c, s=s, v=v, w=w)
-        near, risk, value = _look_up(field, m.x, m.y)
+        near, risk, value = read(m.x, m.y)
         going = alive & (arc < reach)
         alive = going & (near >= block)
         hit = hit | (going & (near < block))
@@ -157,9 +162,9 @@ def _score_block(
     return scores, terms
 
 
-@partial(jax.jit, static_argnames=("dt", "num_steps", "block_size"))
+@partial(jax.jit, static_argnames=("dt", "num_steps", "block_size", "reader"))
 def score(
-    field: GridMap,
+    field: Any,
     candidates: Candidates,
     params: ScoreParams,
     robot: RobotParams,
@@ -167,19 +172,21 @@ def score(
     dt: float,
     num_steps: int,
     block_size: int = 8192,
+    reader: Callable[[Any, Array, Array], tuple[Array, Array, Array]] = look_up,
 ) -> Scores:
     """Roll out K candidates and score them (module docstring).
 
     Args:
-        field: Packed words (`costmap`) `[H, W]` in the frame of the candidates.
+        field: Packed words (`costmap`) `[H, W]` in the frame of the candidates, or what `reader` reads.
         candidates: K ways to go on.
         params: Weights and ranges.
         robot: Radius and limits.
         dt: Step of the rollout [s].
         num_steps: T, steps rolled out; `params.horizon` masks what lies beyond it.
         block_size: Candidates worked on at a time.
+        reader: How `field` is read at (x, y): clearance, risk, value. Another one may read other layers.
     """
-    return _blocks(field, candidates, params, robot, dt, num_steps, block_size)[0]
+    return _blocks(partial(reader, field), candidates, params, robot, dt, num_steps, block_size)[0]
 
 
 @partial(jax.jit, static_argnames=("dt", "num_steps"))
@@ -187,19 +194,19 @@ def explain(
     field: GridMap, candidates: Candidates, params: ScoreParams, robot: RobotParams, *, dt: float, num_steps: int
 ) -> Terms:
     """The terms of the scores of K (few) candidates; arguments as in `score`."""
-    return _blocks(field, candidates, params, robot, dt, num_steps, candidates.v.shape[0])[1]
+    return _blocks(partial(look_up, field), candidates, params, robot, dt, num_steps, candidates.v.shape[0])[1]
 
 
 def _blocks(
-    field: GridMap, candidates: Candidates, params: ScoreParams, robot: RobotParams, dt: float, num: int, size: int
+    read: Reader, candidates: Candidates, params: ScoreParams, robot: RobotParams, dt: float, num: int, size: int
 ) -> tuple[Scores, Terms]:
     count = candidates.v.shape[0]
     # a robot that stands closer than the margin may leave: nothing blocks it but coming closer still
-    near, _, _ = _look_up(field, candidates.motion.x[:1], candidates.motion.y[:1])
+    near, _, _ = read(candidates.motion.x[:1], candidates.motion.y[:1])
     block = jnp.minimum(robot.radius + params.margin, near[0] - costmap.CLEARANCE_STEP)
 
     def run(part: Candidates) -> tuple[Scores, Terms]:
-        return _score_block(field, part, params, robot, block, dt, num)
+        return _score_block(read, part, params, robot, block, dt, num)
 
     if count <= size or count % size:
         return run(candidates)
@@ -207,7 +214,7 @@ def _blocks(
     return jax.tree.map(lambda a: a.reshape(-1), jax.lax.map(run, parts))
 
 
-def at(values: NamedTuple, index: Array) -> NamedTuple:
+def at(values: _Each, index: Array) -> _Each:
     """Candidate `index` of any of the tuples here, as arrays of length 1."""
     return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, index, 1), values)
 

@@ -5,7 +5,8 @@ speeds at their limits; at every sample of that motion the footprint must stay c
 margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
 certified command in a static world; if the map changed its mind, the answer is to brake.
 
-Certified candidates are then rolled out over `sim_time` and ranked by the time still needed from the last free pose,
+Certified candidates are then rolled out in two halves - the second on along the arc, straight, or turning the other way
+round - and ranked by the time still needed from the last free pose of the best of the three,
 
     J = (|g - p| + w_c sum ((d_soft - d) / (d_soft - d_block))_+^2 ds) / v_max + w_h |bearing error| / w_max
         + w_r (d_block - d_last)_+ + w_s |omega - omega_0| / w_max
@@ -39,15 +40,15 @@ class TrackerSpec:
         num_speeds: Levels of v.
         num_turns: Levels of omega.
         dt: Tick [s].
-        num_steps: Steps of the ranking rollout, each `dt`.
+        num_steps: Steps of each half of the ranking rollout, each `dt`; twice that when slow.
         brake_ticks: Ticks within which every certified motion must have stopped.
         samples: Footprint checks per tick of the certificate.
     """
 
-    num_speeds: int = 11
-    num_turns: int = 21
+    num_speeds: int = 9
+    num_turns: int = 15
     dt: float = 0.1
-    num_steps: int = 12
+    num_steps: int = 6
     brake_ticks: int = 10
     samples: int = 2
 
@@ -66,6 +67,7 @@ class TrackerParams(NamedTuple):
     room: Scalar = 100.0  # [] w_r: ending nearer to an obstacle than the margin [s/m]
     soft_clearance: Scalar = 0.3  # [] beyond the radius: where the clearance term begins [m]
     smoothness: Scalar = 0.05  # [] w_s [s]
+    slow: Scalar = 0.3  # [] share of v_max below which the robot is slow
 
 
 class Track(NamedTuple):
@@ -153,16 +155,23 @@ def track(
     soft = robot.radius + params.soft_clearance
     slope = 1.0 / jnp.maximum(params.soft_clearance - params.margin, 1e-3)
 
+    # a slow robot looks twice as far ahead in time: what it needs there is room to turn, not reaction
+    pace = jnp.where(jnp.abs(v0) < params.slow * robot.v_max, 2.0 * dt, dt)
+
     def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
         m, lack, free = carry
-        ahead = dynamics.advance(m, v, w, robot, dt)
+        ahead = dynamics.advance(m, m.v, m.w, robot, pace)
         near = room(ahead)
         free = free & (near >= block)
         m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
-        return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(v) * dt, free), None
+        return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
 
     carry = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
-    (last, lack, _), _ = jax.lax.scan(roll, carry, None, length=spec.num_steps)
+    half, _ = jax.lax.scan(roll, carry, None, length=spec.num_steps)
+    # then on along the arc, straight on, or the other way round: what gets a robot through a gap it is not in line with
+    m, lack, free = jax.tree.map(lambda a: jnp.tile(a, 3), half)
+    m = m._replace(w=jnp.concatenate([w, jnp.zeros_like(w), -w]))
+    (last, lack, _), _ = jax.lax.scan(roll, (m, lack, free), None, length=spec.num_steps)
     dx, dy = target[0] - last.x, target[1] - last.y
     distance = jnp.hypot(dx, dy)
     bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))
@@ -170,9 +179,10 @@ def track(
         (distance + params.clearance * lack) / robot.v_max
         + params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0)
         + params.room * jnp.maximum(limit - room(last), 0.0)
-        + params.smoothness * jnp.abs(w - w0) / robot.w_max
+        + params.smoothness * jnp.tile(jnp.abs(w - w0), 3) / robot.w_max
     )
     cost = jnp.where(seek_room, -room(last), cost)
+    cost = jnp.min(cost.reshape(3, -1), axis=0)
     cost = jnp.where(certified, cost, jnp.inf)
     k = jnp.argmin(cost)
     any_certified = jnp.any(certified)
