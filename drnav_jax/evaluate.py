@@ -1,4 +1,4 @@
-"""Closed-loop evaluation: scenes with trips -> batched episodes -> records. What `drnav run` and the experiments share."""
+"""Closed-loop evaluation: scenes with trips -> batched episodes -> records. What the commands and experiments share."""
 
 import dataclasses
 import functools
@@ -115,7 +115,7 @@ def policy_of(spec: NavSpec) -> episode.Policy:
 
 def plan_margin(params: NavParams) -> float:
     """The outermost planning margin beyond the radius [m]: what the optimal time is computed with."""
-    return float(params.route.closed_margin) + 0.04
+    return float(params.route.closed_margin) + 0.02
 
 
 def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:
@@ -280,7 +280,7 @@ def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[st
     state, scene = result.state, trip.scene
     assert scene.start is not None and scene.goal is not None
     ticks = int(result.log.active[k].sum())
-    return metrics.episode(
+    record = metrics.episode(
         world=scene.name,
         success=bool(state.success[k]),
         collision=bool(state.collision[k]),
@@ -294,6 +294,8 @@ def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[st
         v_max=v_max,
         reference_length=scene.reference_length,
     )
+    ends = {"start": [round(float(x), 4) for x in scene.start], "goal": [round(float(x), 4) for x in scene.goal]}
+    return record | {"time_limit_s": round(trip.time_limit, 3), **ends}
 
 
 def path_driven(result: episode.Result, k: int, start: tuple[float, float, float]) -> np.ndarray:

@@ -24,7 +24,6 @@ UNREACHABLE = 1e4  # [m] value of a cell from which no goal can be reached, cost
 _STRAIGHT = ((0, 1), (0, -1), (1, 0), (-1, 0))
 _DIAGONAL = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 _KNIGHT = ((1, 2), (1, -2), (-1, 2), (-1, -2), (2, 1), (2, -1), (-2, 1), (-2, -1))
-_MOVES = ((_STRAIGHT, 1.0), (_DIAGONAL, 2**0.5), (_KNIGHT, 5**0.5))
 
 
 @partial(jax.jit, static_argnames=("max_distance", "resolution"))
@@ -92,18 +91,38 @@ def flood_fill(passable: Bool[Array, "H W"], seeds: Bool[Array, "H W"]) -> Bool[
     return _unpack(filled, passable.shape[1])
 
 
-def _everywhere(mask: Bool[Array, "H W"], reach: int) -> Bool[Array, "H W"]:
-    """Whether the mask holds on all cells within `reach` (Chebyshev); beyond the edge it does."""
+def _everywhere(mask: Bool[Array, "H W"], rows: tuple[int, int], cols: tuple[int, int]) -> Bool[Array, "H W"]:
+    """Whether the mask holds on all cells from (i - rows[0], j - cols[0]) to (i + rows[1], j + cols[1]).
+
+    Beyond the edge it does.
+    """
     h, w = mask.shape
-    n = 2 * reach + 1
-    padded = jnp.pad(mask, reach, constant_values=True)
-    rows = padded[:, :w]
-    for k in range(1, n):
-        rows = rows & padded[:, k : k + w]
-    out = rows[:h]
-    for k in range(1, n):
-        out = out & rows[k : k + h]
-    return out
+    padded = jnp.pad(mask, (rows, cols), constant_values=True)
+    along = reduce(jnp.logical_and, [padded[:, k : k + w] for k in range(sum(cols) + 1)])
+    return reduce(jnp.logical_and, [along[k : k + h] for k in range(sum(rows) + 1)])
+
+
+def _step_costs(
+    cell_cost: Float[Array, "H W"], resolution: Scalar, east: Array | None, north: Array | None
+) -> list[Array]:
+    """What each move, in the order straight, diagonal, knight, costs from each cell; `UNREACHABLE` where it is not allowed (see `cost_to_go`)."""
+    h, w = cell_cost.shape
+    enter = cell_cost < UNREACHABLE
+    ahead = jnp.pad(enter, ((0, 1), (0, 1)))
+    east = (enter & ahead[:h, 1:]) if east is None else (east & enter & ahead[:h, 1:])
+    north = (enter & ahead[1:, :w]) if north is None else (north & enter & ahead[1:, :w])
+    west, south = jnp.pad(east, ((0, 0), (1, 0)))[:, :w], jnp.pad(north, ((1, 0), (0, 0)))[:h]
+    # at the window's edge there is no side to be open: it does not make a cell narrow
+    last_row, last_col = (jnp.arange(h) == h - 1)[:, None], (jnp.arange(w) == w - 1)[None, :]
+
+    def roomy(n: int) -> Array:
+        sides = _everywhere(east | last_col, (n, n), (n, n - 1)) & _everywhere(north | last_row, (n, n - 1), (n, n))
+        return _everywhere(enter, (n, n), (n, n)) & sides
+
+    step = jnp.minimum(cell_cost * resolution, UNREACHABLE)
+    gate = lambda allowed, length: jnp.where(allowed, length * step, UNREACHABLE)  # noqa: E731
+    diagonal, knight = gate(roomy(1), 2**0.5), gate(roomy(2), 5**0.5)
+    return [gate(a, 1.0) for a in (east, west, north, south)] + [diagonal] * 4 + [knight] * 8
 
 
 @partial(jax.jit, static_argnames=("max_iterations",))
@@ -130,24 +149,14 @@ def cost_to_go(
         max_iterations: Bound on the sweeps; the iteration stops by itself when nothing changes.
     """
     h, w = cell_cost.shape
-    enter = cell_cost < UNREACHABLE
-    ahead = jnp.pad(enter, ((0, 1), (0, 1)))
-    east = (enter & ahead[:h, 1:]) if east is None else (east & enter & ahead[:h, 1:])
-    north = (enter & ahead[1:, :w]) if north is None else (north & enter & ahead[1:, :w])
-    # at the window's edge there is no side to be open: it does not make a cell narrow
-    sides = enter & (east | (jnp.arange(w) == w - 1)[None, :]) & (north | (jnp.arange(h) == h - 1)[:, None])
-    roomy = _everywhere(sides, 1)
-    step = jnp.minimum(cell_cost * resolution, UNREACHABLE)
-    gate = lambda allowed, length: jnp.where(allowed, length * step, UNREACHABLE)  # noqa: E731
-    west, south = jnp.pad(east, ((0, 0), (1, 0)))[:, :w], jnp.pad(north, ((1, 0), (0, 0)))[:h]
-    costs = [gate(a, 1.0) for a in (east, west, north, south)]
-    diagonal, knight = gate(roomy, 2**0.5), gate(_everywhere(sides, 2), 5**0.5)
+    costs = _step_costs(cell_cost, resolution, east, north)
+    straight, diagonal, knight = costs[:4], costs[4], costs[8]
 
     def relax(value: Array) -> Array:
         padded = jnp.pad(value, 2, constant_values=UNREACHABLE)
         look = lambda move: padded[2 + move[0] : 2 + move[0] + h, 2 + move[1] : 2 + move[1] + w]  # noqa: E731
         best = value
-        for move, cost in zip(_STRAIGHT, costs, strict=True):
+        for move, cost in zip(_STRAIGHT, straight, strict=True):
             best = jnp.minimum(best, look(move) + cost)
         for moves, cost in ((_DIAGONAL, diagonal), (_KNIGHT, knight)):
             best = jnp.minimum(best, reduce(jnp.minimum, map(look, moves)) + cost)
@@ -169,30 +178,41 @@ def cost_to_go(
 
 @partial(jax.jit, static_argnames=("num_steps",))
 def descend(
-    value: Float[Array, "H W"], start: Int[Array, "2"], *, num_steps: int
-) -> tuple[Int[Array, "T 2"], Bool[Array, "T"]]:
+    value: Float[Array, "H W"],
+    start: Int[Array, "2"],
+    cell_cost: Float[Array, "H W"],
+    *,
+    resolution: Scalar,
+    num_steps: int,
+    east: Bool[Array, "H W"] | None = None,
+    north: Bool[Array, "H W"] | None = None,
+) -> tuple[Int[Array, "T 2"], Bool[Array, " T"]]:
     """The shortest path down a cost-to-go: cells visited, and which of them still move.
 
     Args:
         value: Result of `cost_to_go`.
         start: (row, column) of the first cell.
+        cell_cost: As given to `cost_to_go`, > 0.
+        resolution: As given to `cost_to_go`.
         num_steps: T, number of moves; once at a minimum the path stays there.
+        east: As given to `cost_to_go`.
+        north: As given to `cost_to_go`.
 
     Returns:
         Cells (row, column) after each move, and whether that move went downhill.
     """
     h, w = value.shape
-    moves = jnp.asarray([m for group, _ in _MOVES for m in group], jnp.int32)
-    lengths = jnp.asarray([length for group, length in _MOVES for _ in group], jnp.float32)
+    moves = jnp.asarray(_STRAIGHT + _DIAGONAL + _KNIGHT, jnp.int32)
+    costs = jnp.stack(_step_costs(cell_cost, resolution, east, north))
 
     def move(cell: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
         nearby = cell[None, :] + moves
         held = jnp.clip(nearby, 0, jnp.asarray([h - 1, w - 1], jnp.int32)[None, :])
-        here = value[cell[0], cell[1]]
-        there = jnp.where(jnp.all(held == nearby, axis=-1), value[held[:, 0], held[:, 1]], UNREACHABLE)
-        slope = (here - there) / lengths
-        best = jnp.argmax(slope)
-        downhill = slope[best] > 0
+        here, there = value[cell[0], cell[1]], value[held[:, 0], held[:, 1]]
+        ahead = jnp.where(jnp.all(held == nearby, axis=-1), there + costs[:, cell[0], cell[1]], UNREACHABLE)
+        best = jnp.argmin(ahead)
+        # at a goal every move costs more than the value there; elsewhere the best one costs just as much
+        downhill = (ahead[best] <= here * (1 + 1e-6)) & (there[best] < here)
         cell = jnp.where(downhill, held[best], cell)
         return cell, (cell, downhill)
 

@@ -23,10 +23,11 @@ from drnav_jax.filter import recovery as recovery_points
 from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
 from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
 from drnav_jax.models import geometric
-from drnav_jax.planning import costmap, dynamics, goal_generator, route, tracker
+from drnav_jax.planning import costmap, dynamics, goal_generator, memory, route, tracker
 from drnav_jax.planning import recovery as behaviour
 from drnav_jax.planning.compositions import Composition
 from drnav_jax.planning.goal_generator import GeneratorSpec, LocalGoal
+from drnav_jax.planning.memory import MemorySpec, MemoryState
 from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
 from drnav_jax.planning.route import RouteParams, RouteSpec
 from drnav_jax.planning.scoring import ScoreParams
@@ -50,6 +51,7 @@ class NavSpec:
         tracker: Samples of the DWA.
         route: Resolution of the cost-to-go.
         recovery_points: Capacity of the recovery points' store.
+        memory: What the route remembers beyond the window.
         local_cells: Edge of the square around the robot that rollouts may use [cells].
         dt: Tick [s].
         replan_every: Ticks per replan.
@@ -62,6 +64,7 @@ class NavSpec:
     tracker: TrackerSpec = TrackerSpec()
     route: RouteSpec = RouteSpec()
     recovery_points: RecoverySpec = RecoverySpec()
+    memory: MemorySpec = MemorySpec()
     local_cells: int = 128
     dt: float = 0.1
     replan_every: int = 5
@@ -73,6 +76,7 @@ class NavSpec:
             raise ValueError(f"local_cells must be even and within 16..{min(shape)}, got {self.local_cells}.")
         if any(n % self.route.pooling for n in shape):
             raise ValueError(f"the window {shape} must be a multiple of route.pooling = {self.route.pooling} cells.")
+        memory.check(self.memory, self.filter.grid)
         if self.dt <= 0 or self.replan_every < 1:
             raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
         if not self.planner.controls and self.generator.num_speeds:
@@ -105,6 +109,7 @@ class NavState(NamedTuple):
     squeeze_until: Array  # [] until then narrower ways than usual are taken, since there was no other [s]
     risk: Array  # [H, W] P_dead^foot above the prior
     points: RecoveryPoints
+    memory: MemoryState
     recovery: RecoveryState
     local_goal: Array  # [2] the last g* [m]
     last_pose: Array  # [3] the last finite pose
@@ -143,6 +148,7 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
         squeeze_until=jnp.zeros((), jnp.float32),
         risk=jnp.zeros(shape, jnp.float32),
         points=recovery_points.init(spec.recovery_points),
+        memory=memory.init(spec.memory),
         recovery=behaviour.init(spec.filter.grid, pose[:2]),
         local_goal=pose[:2],
         last_pose=pose,
@@ -181,16 +187,19 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
     moved, _ = belief.observe(spec.filter, params.filter, kept, seen.pose, seen.points, seen.point_valid)
     by = moved.corner - state.belief.corner
 
-    def shifted() -> tuple[Array, Array, Array]:
+    def shifted() -> tuple[Array, Array, Array, MemoryState]:
         return (
             geometry.shift(state.plan, by, _NO_PLAN),
             geometry.shift(state.risk, by, 0.0),
             geometry.shift(state.recovery.visits, by, 0.0),
+            memory.shift(spec.memory, state.memory, by),
         )
 
-    unmoved = lambda: (state.plan, state.risk, state.recovery.visits)  # noqa: E731
-    plan, risk, visits = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
-    return state._replace(belief=moved, plan=plan, risk=risk, recovery=state.recovery._replace(visits=visits))
+    unmoved = lambda: (state.plan, state.risk, state.recovery.visits, state.memory)  # noqa: E731
+    plan, risk, visits, held = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
+    return state._replace(
+        belief=moved, plan=plan, risk=risk, memory=held, recovery=state.recovery._replace(visits=visits)
+    )
 
 
 def _local_corner(spec: NavSpec) -> tuple[int, int]:
@@ -235,6 +244,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     near = costmap.pool(_fine_clearance(spec, state.belief), 2, "max")  # what rollouts will find there
     clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
+    remembered = state.memory
     retreating = recover.mode == behaviour.RETREAT
     if planner.recovery:
         x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
@@ -247,9 +257,17 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         goal = jnp.where(retreating, recover.target, goal)
     if planner.needs_route or planner.recovery:
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
+        squeeze = state.time < state.squeeze_until
+        margin = jnp.where(squeeze, params.route.squeeze_margin, params.route.closed_margin)
+        remembered = memory.update(
+            spec.memory, remembered, clear >= robot.radius + margin, local.origin, grid.resolution, seen.goal
+        )
+        # a recovery point is near: leaving the window to get there is out of the question
+        beyond = memory.beyond(spec.memory, remembered, grid.shape, spec.route.pooling)
+        beyond = jnp.where(retreating, grids.UNREACHABLE, beyond)
         found = route.solve(
             spec.route, params.route, clear, priced, jnp.where(retreating, 0.0, visits), local.origin,
-            grid.resolution, seen.pose[:2], goal, robot, state.time < state.squeeze_until,
+            grid.resolution, seen.pose[:2], goal, robot, squeeze, beyond,
         )  # fmt: skip
         value, reachable = found.value, found.reachable
         until = jnp.where(reachable, state.squeeze_until, state.time + params.squeeze_time)
@@ -263,7 +281,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     exposed = exposed if planner.exposure else nothing
     return state._replace(
         belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, squeeze_until=until,
-        points=points,
+        points=points, memory=remembered,
     )
 
 
@@ -296,7 +314,7 @@ def _act(
             geometry.sample_nearest(visited, points.xy, fill=0.0), pose[:2],
         )  # fmt: skip
         recover = behaviour.update(
-            grid, params.recovery, recover, time, spec.dt, pose[:2], window.origin, choice.valid, state.reachable,
+            grid, params.recovery, recover, time, spec.dt, pose[:2], jnp.abs(twist[0]) * spec.dt, window.origin, choice.valid, state.reachable,
             refuge, has_refuge,
         )  # fmt: skip
     track = tracker.track(

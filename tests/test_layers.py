@@ -24,6 +24,8 @@ RANKS = {
     "dataset": 3,
     "train": 3,
     "bench": 3,
+    "report": 3,
+    "sources": 3,
     "navigator": 2,
     "models": 1,
     "filter": 1,

@@ -48,6 +48,7 @@ class OccupancyParams(NamedTuple):
     sensor_z: Scalar = 0.5  # [] height of the LiDAR above the ground, over base_link [m]
     max_range: Scalar = 12.0  # [] a point this far from the LiDAR is a beam that met nothing [m]
     min_range: Scalar = 0.15  # [] nearer points are the robot itself and count as invalid [m]
+    min_share: Scalar = 0.15  # [] fewer returns than this share of a neighbouring cell's make no hit
     margin: Scalar = 0.7  # [] distance kept from a return when clearing [cells]
     body_radius: Scalar = 0.2  # [] cells this near to the robot's centre are seen free [m]
     blind_range: Scalar = 0.75  # [] nearer than this, occupied cells are not cleared [m]
@@ -144,7 +145,10 @@ def observed(
     )
     counted = jnp.stack([jnp.ones_like(place_x), place_x, place_y], axis=-1)
     total = jnp.zeros((h * w, 3), jnp.float32).at[flat_index].add(counted, mode="drop").reshape(h, w, 3)
-    hit = total[..., 0] > 0
+    # range noise throws a few of the many returns of a near wall into the cells before it: those are no wall
+    peak = jax.lax.reduce_window(total[..., 0], 0.0, jax.lax.max, (3, 1), (1, 1), "SAME")
+    peak = jax.lax.reduce_window(peak, 0.0, jax.lax.max, (1, 3), (1, 1), "SAME")
+    hit = (total[..., 0] > 0) & (total[..., 0] >= params.min_share * peak)
     within = total[..., 1:] / jnp.maximum(total[..., :1], 1.0)
 
     x, y = geometry.cell_centres(shape, origin, resolution)
@@ -158,7 +162,7 @@ def observed(
     index = jnp.clip(place.astype(jnp.int32), 0, num_bearings - 1)
     limit = least.at[index].get(mode="promise_in_bounds")
     limit = jnp.maximum(limit - params.margin * resolution, params.body_radius)
-    return hit, (dx * dx + dy * dy < jnp.square(limit)) & ~hit, within
+    return hit, (dx * dx + dy * dy < jnp.square(limit)) & (total[..., 0] == 0), within
 
 
 @partial(jax.jit, static_argnames="num_bearings")

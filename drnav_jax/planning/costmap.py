@@ -66,6 +66,19 @@ def repeat(values: Array, by: int) -> Array:
     return jnp.repeat(jnp.repeat(values, by, axis=0), by, axis=1)
 
 
+def sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
+    """Through which east and north sides of the coarse cells one gets from free map cell to free map cell.
+
+    A coarse cell is open if any of its map cells is, so that narrow ways stay; but without this test it would also
+    join cells between which there is no way.
+    """
+    h, w = free.shape
+    ahead = jnp.pad(free, ((0, 1), (0, 1)))
+    across = (free & ahead[:h, 1:])[:, by - 1 :: by].reshape(h // by, by, w // by)
+    along = (free & ahead[1:, :w])[by - 1 :: by].reshape(h // by, w // by, by)
+    return jnp.any(across, axis=1), jnp.any(along, axis=2)
+
+
 @jax.jit
 def pack_plan(risk: Float[Array, "H W"], value: Float[Array, "H W"]) -> Int[Array, "H W"]:
     """The two layers that change only when one replans, with room for the clearance.

@@ -12,7 +12,9 @@ Modes and the rules between them (time in seconds; every rule is a Param):
              as soon as a way is known.
 
 Where the robot got stuck is remembered in a field of visits of its own, which decays and is never written into P_dead:
-a retreat stamped into the belief would close the only way. Attempts are counted until the robot is `forget_radius` away
+a retreat stamped into the belief would close the only way. Driving leaves a faint visit, too: the window forgets what
+rolls out of it, and a robot that swings between two ways of which it always forgets one drives each time at a higher
+price until it goes on. Attempts are counted until the robot is `forget_radius` away
 from where the first one began, so it does not swing between the same two answers.
 """
 
@@ -44,7 +46,8 @@ class RecoveryParams(NamedTuple):
     forget_radius: Scalar = 3.0  # [] [m]
     hopeless_time: Scalar = 10.0  # [] [s]
     visit_radius: Scalar = 1.0  # [] extent of one visit [m]
-    visit_time: Scalar = 60.0  # [] decay time of visits [s]
+    visit_time: Scalar = 100.0  # [] decay time of visits [s]
+    visit_driven: Scalar = 0.1  # [] visit left per metre driven [1/m]
     openness: Scalar = 1.0  # [] worth of one open direction of a recovery point [m]
     min_distance: Scalar = 1.0  # [] recovery points nearer than this are no retreat [m]
 
@@ -105,6 +108,7 @@ def update(
     time: Scalar,
     dt: Scalar,
     xy: Float[Array, "2"],
+    driven: Scalar,
     origin: Float[Array, "2"],
     candidate_free: Bool[Array, ""],
     has_way: Bool[Array, ""],
@@ -120,6 +124,7 @@ def update(
         time: Now [s].
         dt: Since the last call [s].
         xy: Robot in odom [m].
+        driven: Since the last call [m].
         origin: Odom position of the window's outer corner [m].
         candidate_free: The generator found a free candidate.
         has_way: A way to the goal (or to the recovery point, in RETREAT) is known.
@@ -175,5 +180,5 @@ def update(
         place=place,
         target=jnp.where(retreat, refuge, state.target),
         entries=state.entries + enter.astype(jnp.int32),
-        visits=jnp.minimum(visits + (here & stamp).astype(jnp.float32), 1.0),
+        visits=jnp.minimum(visits + here * jnp.where(stamp, 1.0, params.visit_driven * driven), 1.0),
     )

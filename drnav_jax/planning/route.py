@@ -6,8 +6,8 @@ Optimistic (unknown = free), on cells `pooling` times as coarse as the map's. A 
 
 with the clearance term of J_geom (`scoring`), so that the value falls along a good path at least as fast as the path's own
 cost grows. Thus the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the only way
-may look like a dead end. A goal outside the window is reached over the window's edge: an edge cell is worth its straight
-distance to the goal. If no way to a goal inside the window is known, edge cells are a last resort.
+may look like a dead end. Edge cells of the window are worth what `memory` says of the world beyond, at least their straight
+distance to the goal.
 """
 
 import dataclasses
@@ -44,15 +44,14 @@ class RouteSpec:
 class RouteParams(NamedTuple):
     """What the route costs."""
 
-    closed_margin: Scalar = 0.06  # [] beyond the radius: cells with less clearance are closed [m]
-    squeeze_margin: Scalar = 0.04  # [] the same, once no way was found at `closed_margin` [m]
+    closed_margin: Scalar = 0.08  # [] beyond the radius: cells with less clearance are closed [m]
+    squeeze_margin: Scalar = 0.05  # [] the same, once no way was found at `closed_margin` [m]
     clearance: Scalar = 1.0  # [] w_o
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
     risk_weight: Scalar = 3.0  # [] lambda inside the cell cost
     risk_cap: Scalar = 4.0  # [] most that risk adds to a metre
     visit_weight: Scalar = 4.0  # [] w_v
     escape_radius: Scalar = 0.6  # [] a robot that stands on a closed cell may pass such this near [m]
-    lost_penalty: Scalar = 100.0  # [] added to leaving the window when the goal is inside it [m]
 
 
 class Route(NamedTuple):
@@ -60,19 +59,6 @@ class Route(NamedTuple):
 
     value: Float[Array, "H W"]  # [m] on the map's cells; `UNREACHABLE` where there is no way
     reachable: Bool[Array, ""]  # the robot has a way (possibly out of the window) to the goal
-
-
-def _sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
-    """Through which east and north sides of the coarse cells one gets from free map cell to free map cell.
-
-    A coarse cell is open if any of its map cells is, so that narrow ways stay; but without this test it would also
-    join cells between which there is no way.
-    """
-    h, w = free.shape
-    ahead = jnp.pad(free, ((0, 1), (0, 1)))
-    across = (free & ahead[:h, 1:])[:, by - 1 :: by].reshape(h // by, by, w // by)
-    along = (free & ahead[1:, :w])[by - 1 :: by].reshape(h // by, w // by, by)
-    return jnp.any(across, axis=1), jnp.any(along, axis=2)
 
 
 def _spread(value: Array, by: int) -> Array:
@@ -107,6 +93,7 @@ def solve(
     goal: Float[Array, "2"],
     robot: RobotParams,
     squeeze: Bool[Array, ""],
+    beyond: Float[Array, "h w"],
 ) -> Route:
     """The optimistic cost-to-go on the window (module docstring).
 
@@ -122,6 +109,8 @@ def solve(
         goal: Where to go [m].
         robot: Its radius.
         squeeze: Use `squeeze_margin`.
+        beyond: What leaving the window there is worth [m], on the route's cells; only its edge is read, and never below
+            the straight distance to the goal.
     """
     by, size = spec.pooling, resolution * spec.pooling
     x, y = geometry.cell_centres(clear.shape, origin, resolution)
@@ -132,7 +121,7 @@ def solve(
     here = geometry.sample_nearest(GridMap(clear, origin, resolution), xy)
     leave = near & (here < closed) & (clear >= here - resolution)
     free = (clear >= closed) | leave | (at_goal & (clear > 0.5 * robot.radius))
-    east, north = _sides(free, by)
+    east, north = costmap.sides(free, by)
     clear, risk, visits = (costmap.pool(a, by, "mean") for a in (clear, risk, visits))
     h, w = clear.shape
     x, y = geometry.cell_centres((h, w), origin, size)
@@ -149,7 +138,7 @@ def solve(
     row, col = jnp.arange(h)[:, None], jnp.arange(w)[None, :]
     edge = (row == 0) | (row == h - 1) | (col == 0) | (col == w - 1)
     held = geometry.inside(geometry.cell_of(goal, origin, size), (h, w))
-    far = jnp.where(edge, to_goal + jnp.where(held, params.lost_penalty, 0.0), grids.UNREACHABLE)
+    far = jnp.where(edge, jnp.maximum(beyond, to_goal), grids.UNREACHABLE)
     initial = jnp.where(held & (to_goal <= 1.5 * size), to_goal, far)
     initial = jnp.where(cost < grids.UNREACHABLE, initial, grids.UNREACHABLE)
     value = grids.cost_to_go(

@@ -107,6 +107,7 @@ def _score_block(
     soft = robot.radius + params.soft_clearance
     slope = 1.0 / jnp.maximum(params.soft_clearance - params.margin, 1e-3)
     reach = jnp.minimum(start.reach, params.range_max)
+    horizon = params.horizon + 1e-3 * dt  # k dt is rounded
     zero = jnp.zeros_like(start.v)
 
     def step(carry: tuple, k: Array) -> tuple[tuple, None]:
@@ -116,7 +117,7 @@ def _score_block(
         ds = jnp.abs(v) * dt
         m = Motion(x=m.x + v * dt * c, y=m.y + v * dt * s, c=c, s=s, v=v, w=w)
         near, risk, value = read(m.x, m.y)
-        going = alive & (arc < reach)
+        going = alive & (arc < reach) & (k * dt <= horizon)
         alive = going & (near >= block)
         hit = hit | (going & (near < block))
         arc = arc + ds
@@ -131,7 +132,7 @@ def _score_block(
             + params.range_bias * jnp.maximum(params.range_min - arc, 0.0)
         )
         score = geometric + params.risk_weight * risk_sum
-        better = alive & (score < best[0]) & (arc >= params.range_least) & (k * dt <= params.horizon)
+        better = alive & (score < best[0]) & (arc >= params.range_least)
         now = (score, m.x, m.y, arc, geometric, risk_sum, cost, turned, value)
         best = tuple(jnp.where(better, a, b) for a, b in zip(now, best, strict=True))
         return (m, arc, cost, risk_sum, turned, alive, hit, best), None
