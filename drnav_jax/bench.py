@@ -268,7 +268,7 @@ def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[st
     the navigator makes. The error is that of nearest packed look-ups against bilinear look-ups in float, over the
     candidates that are free in both: of the score, relative to the way it counts (score less the least value).
     """
-    local, field = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, drive.end)
+    local, field = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, navigator.NavParams(), drive.end)
     params = drive.params.score._replace(horizon=jnp.asarray(0.1 * NUM_STEPS, jnp.float32))
     robot = drive.params.robot
 

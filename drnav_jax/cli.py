@@ -8,16 +8,14 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TextIO
 
 import jax
-import numpy as np
 import tyro
 
 from drnav_jax import __version__, bench, evaluate, report, sources
-from drnav_jax.planning import PLANNERS
+from drnav_jax.planning import PLANNERS, planner
 from drnav_jax.sim import episode
 from drnav_jax.viz import MissingExtra
 from drnav_jax.worlds import Scene
@@ -43,7 +41,7 @@ class Trial:
     Attributes:
         world: Seeded family of worlds: open, u, corridor, t, l, or an open twin such as u-open. With --episodes N the
             worlds of SEED to SEED+N-1.
-        map: map_server yaml, or a floor plan (png, pgm, ...; light = free) with --resolution.
+        map: map_server yaml; or, with --resolution, an image of a floor plan: light = free, a light outside is filled.
         barn: BARN .world file, or a folder of them; brings its own start, goal, tolerance and time limit.
         movingai: Moving AI .map file. Trips of FILE.scen if it is there, else sampled ones.
         resolution: Edge of a pixel or Moving AI cell [m].
@@ -198,13 +196,15 @@ def folder_of(args: Run | Compare) -> Path:
     """Where to write, made if need be.
 
     Raises:
-        OSError: If it cannot be.
+        ValueError: If it cannot be.
     """
     source = args.world or str((args.map or args.barn or args.movingai or Path()).resolve().stem)
     out = args.out or Path("results") / f"{_command(args)}-{re.sub(r'[^A-Za-z0-9._-]+', '-', source)}"
-    out.mkdir(parents=True, exist_ok=True)
-    if not os.access(out, os.W_OK):
-        raise PermissionError(f"{out}: cannot be written to; choose another --out.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "summary.json").open("a").close()
+    except OSError as error:
+        raise ValueError(f"{out}: cannot be written to ({error.strerror}); choose another --out.") from None
     return out
 
 
@@ -274,50 +274,40 @@ def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
     each = {name: {"episodes": e.records, "summary": e.summary} for name, e in finished.evaluations.items()}
     if isinstance(args, Run):
         return head | each[args.planner]
-    times = {}
-    for name, e in finished.evaluations.items():
-        spent = evaluate.metrics.time_to_goal(e.records, [t.time_limit for t in e.trips])
-        pairs = zip(spent, e.records, strict=True)
-        times[name] = dict(zip(_kept(e), [(float(t), r["success"]) for t, r in pairs], strict=True))
+    times = {name: evaluate.times_to_goal(e) for name, e in finished.evaluations.items()}
     return head | {"planners": each, "ratios": report.ratios(times)}
 
 
-def _kept(e: evaluate.Evaluation) -> list[int]:
-    """Numbers of the finished trips."""
-    return [int(k) for k in np.flatnonzero(e.result.finished)]
-
-
 def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], finished: Finished) -> None:
-    """Pictures of the first episodes, with the belief of the first planner, and a film of the first one."""
-    first = next(iter(finished.evaluations))
+    """Pictures of the first episodes with the belief of the first planner that has one, a film of the first episode."""
+    believers = [name for name in finished.evaluations if planner(name).risk_in_route or planner(name).exposure]
+    first = (believers or list(finished.evaluations))[0]
     setup, evaluation = setups[first], finished.evaluations[first]
     spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
-    for number, k in enumerate(_kept(evaluation)[:PICTURES], 1):
+    for number, k in enumerate(evaluation.kept[:PICTURES], 1):
         trip = trips[k]
         assert trip.scene.start is not None
         drives = {}
         for name, e in finished.evaluations.items():
-            if k in (kept := _kept(e)):
+            if k in e.kept:
                 path = evaluate.path_driven(e.result, k, trip.scene.start)
-                drives[name] = report.Drive(path, e.records[kept.index(k)])
+                drives[name] = report.Drive(path, e.records[e.kept.index(k)])
         batch = jax.tree.map(lambda a: a[0], evaluate.episode_params([trip], setup))
         states = episode.replay(SPEC, evaluate.policy_of(spec), batch, keys[k])
         path = drives[first].path
         every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
         believed = report.believe(states, spec.filter, path, SPEC.dt, every)
         file = out / ("trajectory.png" if number == 1 else f"trajectory-{number}.png")
-        title = f"{trip.scene.name}, belief of {first}"
+        title = f"{trip.scene.name}: what {first} believed" if believers else f"{trip.scene.name}: what {first} saw"
         report.picture(file, trip.scene, drives, believed, trip.path, trip.goal_tolerance, title)
         if number == 1:
             report.film(out / "belief.gif", trip.scene, believed, trip.goal_tolerance, setup.robot_radius)
 
 
-@contextlib.contextmanager
-def _stdout_kept(json: bool) -> Iterator[None]:
+def _stdout_kept(json: bool) -> contextlib.AbstractContextManager:
     """With --json, what a library prints goes to stderr."""
-    with contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext():
-        yield
+    return contextlib.redirect_stdout(sys.stderr) if json else contextlib.nullcontext()
 
 
 def perform(args: Run | Compare) -> int:
@@ -372,7 +362,7 @@ def _measure(args: Bench) -> int:
 
 def _cache_programs() -> None:
     """Keep compiled programs for the next command, unless somebody has already said where."""
-    if jax.config.jax_compilation_cache_dir is not None:
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
         return
     root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(root) / "drnav_jax"

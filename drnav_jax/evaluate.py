@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy import ndimage
 
 from drnav_jax import metrics, navigator, worlds
 from drnav_jax.models import geometric, oracle, silent
@@ -138,13 +139,21 @@ def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:
     return trips
 
 
+def _float32(values: Any) -> Any:
+    """Host values; `Any`, since containers declare their fields for JAX's arrays."""
+    return np.asarray(values, np.float32)
+
+
+def _distance(mask: np.ndarray) -> np.ndarray:
+    """Distance of each cell to the mask [cells]."""
+    return np.asarray(ndimage.distance_transform_edt(~mask))
+
+
 def label_map(trip: Trip, radius: float) -> GridMap:
     """Trip-conditioned true labels (`worlds.labels`) as the oracle reads them: 1 = dead end.
 
     Labels are defined where a robot's centre may be; they are grown by its radius so that they fill their pockets.
     """
-    from scipy import ndimage
-
     scene = trip.scene
     occupied, resolution, field = scene.occupied, scene.resolution, None
     if resolution < LABEL_RESOLUTION - 1e-6:
@@ -158,15 +167,11 @@ def label_map(trip: Trip, radius: float) -> GridMap:
     mouth = 5.0 if scene.outside_is_free else 2.5
     spec = LabelSpec(radius=radius, mouth=mouth)
     label = dead_ends(occupied, resolution, spec, trip_path=cells[inside]).label
-    grown = ndimage.distance_transform_edt(~label) * resolution <= radius if label.any() else label
+    grown = _distance(label) * resolution <= radius if label.any() else label
     # growing must not reach out of the mouth: only over cells where no robot's centre can be
-    clearance = ndimage.distance_transform_edt(~occupied) * resolution if occupied.any() else np.full(label.shape, 9.0)
+    clearance = _distance(occupied) * resolution if occupied.any() else np.full(label.shape, 9.0)
     filled = label | (grown & (clearance <= radius + 0.5 * resolution))
-    return GridMap(
-        values=filled.astype(np.float32),
-        origin=np.asarray(scene.origin, np.float32),
-        resolution=np.asarray(resolution, np.float32),
-    )
+    return GridMap(values=_float32(filled), origin=_float32(scene.origin), resolution=_float32(resolution))
 
 
 def params_of(setup: Setup) -> NavParams:
@@ -212,10 +217,10 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
     spread = lambda tree: _stack([tree] * batch)  # noqa: E731
     return EpisodeParams(
         world=worlds.stack_worlds([t.scene.world for t in trips]),
-        start=np.asarray([t.scene.start for t in trips], np.float32),
-        goal=np.asarray([t.scene.goal for t in trips], np.float32),
-        time_limit=np.asarray([t.time_limit for t in trips], np.float32),
-        goal_tolerance=np.asarray([t.goal_tolerance for t in trips], np.float32),
+        start=_float32([t.scene.start for t in trips]),
+        goal=_float32([t.scene.goal for t in trips]),
+        time_limit=_float32([t.time_limit for t in trips]),
+        goal_tolerance=_float32([t.goal_tolerance for t in trips]),
         robot=spread(params.robot),
         policy=_stack(each),
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
@@ -229,6 +234,7 @@ class Evaluation(NamedTuple):
     records: list[dict[str, Any]]  # of the finished episodes, in the order of the trips
     summary: dict[str, Any]
     trips: list[Trip]  # the finished ones
+    kept: list[int]  # their numbers among all trips
     result: episode.Result
     interrupted: bool
     wall_s: float
@@ -270,6 +276,7 @@ def evaluate(
         records=records,
         summary=metrics.summary(records, [trips[k].time_limit for k in kept]),
         trips=[trips[k] for k in kept],
+        kept=kept,
         result=result,
         interrupted=len(kept) < len(trips),
         wall_s=time.perf_counter() - begin,
@@ -296,6 +303,13 @@ def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[st
     )
     ends = {"start": [round(float(x), 4) for x in scene.start], "goal": [round(float(x), 4) for x in scene.goal]}
     return record | {"time_limit_s": round(trip.time_limit, 3), **ends}
+
+
+def times_to_goal(evaluation: Evaluation) -> dict[int, tuple[float, bool]]:
+    """Number of the trip -> time to the goal [s], a failure counting as its limit, and success."""
+    records = evaluation.records
+    times = metrics.time_to_goal(records, [trip.time_limit for trip in evaluation.trips])
+    return {k: (float(t), r["success"]) for k, t, r in zip(evaluation.kept, times, records, strict=True)}
 
 
 def path_driven(result: episode.Result, k: int, start: tuple[float, float, float]) -> np.ndarray:

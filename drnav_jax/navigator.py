@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from drnav_jax import geometry, grids
-from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief, dead_end, occupancy
+from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief, dead_end
 from drnav_jax.filter import recovery as recovery_points
 from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
 from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
@@ -52,7 +52,6 @@ class NavSpec:
         route: Resolution of the cost-to-go.
         recovery_points: Capacity of the recovery points' store.
         memory: What the route remembers beyond the window.
-        local_cells: Edge of the square around the robot that rollouts may use [cells].
         dt: Tick [s].
         replan_every: Ticks per replan.
     """
@@ -65,15 +64,12 @@ class NavSpec:
     route: RouteSpec = RouteSpec()
     recovery_points: RecoverySpec = RecoverySpec()
     memory: MemorySpec = MemorySpec()
-    local_cells: int = 128
     dt: float = 0.1
     replan_every: int = 5
 
     def __post_init__(self) -> None:
         """Check that the parts fit together."""
         shape = self.filter.grid.shape
-        if self.local_cells % 2 or not 16 <= self.local_cells <= min(shape):
-            raise ValueError(f"local_cells must be even and within 16..{min(shape)}, got {self.local_cells}.")
         if any(n % self.route.pooling for n in shape):
             raise ValueError(f"the window {shape} must be a multiple of route.pooling = {self.route.pooling} cells.")
         memory.check(self.memory, self.filter.grid)
@@ -202,27 +198,18 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
     )
 
 
-def _local_corner(spec: NavSpec) -> tuple[int, int]:
-    """(row, column) of the window at which the square for rollouts begins."""
-    h, w = spec.filter.grid.shape
-    return (h - spec.local_cells) // 2, (w - spec.local_cells) // 2
+def _fine_clearance(spec: NavSpec, params: NavParams, held: FilterState) -> Float[Array, "n n"]:
+    """Clearance [m] around the robot on cells of half the map's edge."""
+    return costmap.clearance(belief.obstacles(spec.filter, params.filter, held), spec.filter.grid.resolution / 2)
 
 
-def _fine_clearance(spec: NavSpec, held: FilterState) -> Float[Array, "n n"]:
-    """Clearance [m] around the robot on cells of half the map's edge, from where surfaces lie within their cells."""
-    n, (top, left) = spec.local_cells, _local_corner(spec)
-    crop = lambda a: a[top : top + n, left : left + n]  # noqa: E731
-    fine = occupancy.fine_obstacles(crop(held.seen & (held.occupancy > 0)), crop(held.surface))
-    return costmap.clearance(fine, spec.filter.grid.resolution / 2)
-
-
-def rollout_field(spec: NavSpec, state: NavState) -> tuple[GridMap, GridMap]:
+def rollout_field(spec: NavSpec, params: NavParams, state: NavState) -> tuple[GridMap, GridMap]:
     """The square around the robot on cells of half the map's edge: clearance [m], and the words that rollouts read."""
-    n, (top, left) = spec.local_cells, _local_corner(spec)
+    n, (top, left) = spec.filter.local_cells, belief.local_corner(spec.filter)
     resolution = spec.filter.grid.resolution
     origin = geometry.window_origin(state.belief.corner, spec.filter.grid)
     corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
-    clear = _fine_clearance(spec, state.belief)
+    clear = _fine_clearance(spec, params, state.belief)
     plan = costmap.repeat(state.plan[top : top + n, left : left + n], 2)
     words = costmap.pack_clearance(plan, clear)
     return GridMap(clear, corner, resolution / 2), GridMap(words, corner, resolution / 2)
@@ -240,8 +227,8 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)
         risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
     clear = costmap.clearance(local.seen & (local.occupancy > 0), grid.resolution)
-    top, left = _local_corner(spec)
-    near = costmap.pool(_fine_clearance(spec, state.belief), 2, "max")  # what rollouts will find there
+    top, left = belief.local_corner(spec.filter)
+    near = costmap.pool(_fine_clearance(spec, params, state.belief), 2, "max")  # what rollouts will find there
     clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
     remembered = state.memory
@@ -292,7 +279,7 @@ def _act(
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
     pose, twist, time = seen.pose, seen.twist, state.time
     window = belief.local_map(spec.filter, state.belief)
-    local, field = rollout_field(spec, state)
+    local, field = rollout_field(spec, params, state)
 
     recover = state.recovery
     heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)

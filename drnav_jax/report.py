@@ -92,7 +92,7 @@ def ratios(times: Mapping[str, Mapping[int, tuple[float, bool]]]) -> dict[str, A
 
 def table(summaries: Mapping[str, Mapping[str, Any]], paired: Mapping[str, Any] | None = None) -> str:
     """Readable text: one row per planner, and one line per ratio of `ratios`."""
-    rows = [COLUMNS]
+    rows: list[tuple[str, ...]] = [COLUMNS]
     for name, s in summaries.items():
         optimal = s["time_to_goal_s"] / s["optimal_s"] if s["optimal_s"] else math.nan
         rows.append((
@@ -110,25 +110,27 @@ def table(summaries: Mapping[str, Mapping[str, Any]], paired: Mapping[str, Any] 
     limits = {s["time_limit_s"] for s in summaries.values()}
     count = {s["episodes"] for s in summaries.values()}
     limit = " / ".join(f"{x:.1f} s" for x in sorted(limits))
-    lines += ["", f"{' / '.join(map(str, sorted(count)))} episodes each; a failure counts as the time limit "
-                  f"({limit} on average) in the time to goal."]  # fmt: skip
+    many = f"{' / '.join(map(str, sorted(count)))} episode{'s' if max(count) > 1 else ''} each"
+    lines += ["", f"{many}; in the time to goal a failure counts as the time limit (mean {limit})."]
     for name, found in (paired or {}).items():
         both = found["both_solve"]
-        solved = "no trip that both solve" if both is None else f"{_interval(both)} on trips that both solve"
+        solved = "no trip was solved by both" if both is None else f"where both arrive {_interval(both)}"
         if found["all"] is not None:
-            lines.append(f"time to goal, {name.replace('/', ' / ')}: {_interval(found['all'])}; {solved}")
+            lines.append(f"time to goal {name.replace('/', ' / ')}: {_interval(found['all'])}; {solved}")
     return "\n".join(lines)
 
 
 def _interval(found: Mapping[str, Any]) -> str:
-    return f"{found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}] ({found['trips']})"
+    if found["trips"] == 1:
+        return f"{found['ratio']:.3f} (1 trip)"
+    return f"{found['ratio']:.3f} [{found['low']:.3f}, {found['high']:.3f}] ({found['trips']} trips)"
 
 
 def outcome(record: Mapping[str, Any]) -> str:
     """How an episode ended, in words."""
     if record["success"]:
-        return f"reached, {record['time_s']:.1f} s"
-    return f"{'collision' if record['collision'] else 'gave up'}, {record['time_s']:.1f} s"
+        return f"reached in {record['time_s']:.1f} s"
+    return f"{'collision after' if record['collision'] else 'not reached in'} {record['time_s']:.1f} s"
 
 
 def believe(
@@ -163,9 +165,14 @@ def believe(
     if mind is None:
         raise ValueError("an episode without states shows no belief.")
     resolution = np.asarray(spec.grid.resolution, np.float32)
-    canvas = GridMap(values=p, origin=low[::-1] * resolution, resolution=resolution)
+    canvas = _grid(p, low[::-1] * resolution, resolution)
     points = np.asarray(mind.points.xy)[np.asarray(mind.points.valid)]
     return Believed(p_dead=canvas, known=known, recovery_points=points, frames=frames)
+
+
+def _grid(values: Any, origin: Any, resolution: Any) -> GridMap:
+    """A grid on the host; `Any`, since containers declare their fields for JAX's arrays."""
+    return GridMap(values=values, origin=origin, resolution=resolution)
 
 
 def _frame(state: EpisodeState, local: Any, seen: np.ndarray, p_dead: np.ndarray, path: np.ndarray, dt: float) -> Any:
@@ -175,8 +182,8 @@ def _frame(state: EpisodeState, local: Any, seen: np.ndarray, p_dead: np.ndarray
     return viz.Frame(
         pose=np.asarray(state.pose),
         path=path[: tick + 1],
-        occupancy=GridMap(np.where(seen, occupied, np.float16(-1)), origin, resolution),
-        p_dead=GridMap(p_dead, origin, resolution),
+        occupancy=_grid(np.where(seen, occupied, np.float16(-1)), origin, resolution),
+        p_dead=_grid(p_dead, origin, resolution),
         recovery_points=np.asarray(mind.points.xy)[np.asarray(mind.points.valid)],
         local_goal=np.asarray(mind.local_goal),
         mode=MODES[int(mind.recovery.mode)],

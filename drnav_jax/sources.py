@@ -15,6 +15,7 @@ from drnav_jax.worlds import Scene
 MIN_TRIP = 8.0  # [m] least length of sampled trips
 MAX_TRIP = 100.0  # [m] longest trip taken from a Moving AI scenario
 CELL = 1.0  # [m] of Moving AI maps: the robot must fit through one
+OUTSIDE_GAP = 1.0  # [m] the light outside of a floor plan comes in through gaps that are wider
 ONE_OF = "--world FAMILY:SEED, --map FILE, --barn FILE_OR_DIR or --movingai FILE"
 
 
@@ -120,6 +121,8 @@ def _map_scene(source: Source) -> Scene:
         raise ValueError(f"{source.map} looks like a Moving AI map: use --movingai.")
     if source.resolution is None:
         raise ValueError(f"{source.map} has no scale: add --resolution M, the edge of a pixel in metres.")
+    with contextlib.suppress(ValueError):  # of a plan without closed outer walls nothing would be left
+        return worlds.load_floor_plan(source.map, source.resolution, OUTSIDE_GAP)
     return worlds.load_floor_plan(source.map, source.resolution)
 
 

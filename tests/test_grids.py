@@ -130,10 +130,13 @@ def test_nothing_is_squeezed_through_a_corner_or_jumped_over():
     assert (value[5:] == grids.UNREACHABLE).all() and (value[:5] < grids.UNREACHABLE).all()
 
 
-def test_without_a_goal_nothing_is_reached_and_no_more_sweeps_are_made_than_allowed():
+def test_without_a_goal_nothing_is_reached_and_no_more_rounds_are_made_than_allowed():
     assert (solve(np.ones((8, 9)), at_goal((8, 9))) == grids.UNREACHABLE).all()
-    cut = grids.cost_to_go(f32(np.ones((8, 60))), f32(at_goal((8, 60), ((0, 0), 0.0))), resolution=0.1, max_iterations=4)
-    assert float(cut[0, 8]) < grids.UNREACHABLE == float(cut[0, 40])
+    cost = np.ones((5, 20))  # up and down between walls: each turn takes a round
+    cost[:4, 1::4] = cost[1:, 3::4] = grids.UNREACHABLE
+    cut = grids.cost_to_go(f32(cost), f32(at_goal((5, 20), ((0, 0), 0.0))), resolution=0.1, max_iterations=2)
+    assert float(cut[0, 2]) < grids.UNREACHABLE == float(cut[0, 18])
+    assert solve(cost, at_goal((5, 20), ((0, 0), 0.0)))[0, 18] < grids.UNREACHABLE
 
 
 @pytest.mark.parametrize("sided", [False, True])

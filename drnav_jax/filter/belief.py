@@ -27,15 +27,22 @@ class FilterSpec:
         grid: The rolling window.
         num_bearings: Bins of the polar profile that clears cells; at most the number of azimuths
             of the LiDAR, or bins stay empty and clear nothing.
+        local_cells: Edge of the square around the robot where surfaces are known to half a cell, and which rollouts may
+            use [cells].
     """
 
     grid: GridSpec = GridSpec()
     num_bearings: int = 180
+    local_cells: int = 128
 
     def __post_init__(self) -> None:
         """Check sizes."""
         if self.num_bearings < 8:
             raise ValueError(f"num_bearings must be >= 8 bins, got {self.num_bearings}.")
+        if self.local_cells % 2 or not 16 <= self.local_cells <= min(self.grid.shape):
+            raise ValueError(
+                f"local_cells must be even and within 16..{min(self.grid.shape)}, got {self.local_cells}."
+            )
 
 
 class FilterParams(NamedTuple):
@@ -50,7 +57,7 @@ class FilterState(NamedTuple):
 
     occupancy: Array  # [H, W] log-odds of being occupied [nat]; 0 where never seen
     seen: Array  # [H, W] bool, observed since the window holds the cell
-    surface: Array  # [H, W, 2] where in an occupied cell its surface lies, x and y from the centre [cells]
+    surface: Array  # [2n, 2n] around the robot: share of a cell's returns in each of its quarters (`occupancy.refine`)
     dead_end: Array  # [H, W] log-odds of being a dead end [nat]
     corner: Array  # [2] int32 (row, column) of cell (0, 0) on the odom lattice
 
@@ -62,7 +69,7 @@ def init(spec: FilterSpec, params: FilterParams, xy: Float[Array, "2"]) -> Filte
     return FilterState(
         occupancy=jnp.zeros(shape, jnp.float32),
         seen=jnp.zeros(shape, bool),
-        surface=jnp.zeros((*shape, 2), jnp.float32),
+        surface=jnp.zeros((2 * spec.local_cells,) * 2, jnp.float32),
         dead_end=jnp.full(shape, dead_end.prior_log_odds(params.dead_end)),
         corner=geometry.window_corner(xy, spec.grid),
     )
@@ -81,12 +88,25 @@ def move(spec: FilterSpec, params: FilterParams, state: FilterState, xy: Float[A
         return FilterState(
             occupancy=geometry.shift(state.occupancy, by, 0.0),
             seen=geometry.shift(state.seen, by, 0.0),
-            surface=jnp.stack([geometry.shift(state.surface[..., a], by, 0.0) for a in (0, 1)], axis=-1),
+            surface=geometry.shift(state.surface, 2 * by, 0.0),
             dead_end=geometry.shift(state.dead_end, by, dead_end.prior_log_odds(params.dead_end)),
             corner=corner,
         )
 
     return jax.lax.cond(jnp.any(by != 0), moved, lambda state: state, state)
+
+
+def local_corner(spec: FilterSpec) -> tuple[int, int]:
+    """(row, column) of the window at which the square of `local_cells` begins."""
+    h, w = spec.grid.shape
+    return (h - spec.local_cells) // 2, (w - spec.local_cells) // 2
+
+
+def obstacles(spec: FilterSpec, params: FilterParams, state: FilterState) -> Bool[Array, "n n"]:
+    """Obstacles around the robot on cells of half the map's edge; begins at `local_corner`."""
+    n, (top, left) = spec.local_cells, local_corner(spec)
+    occupied = (state.seen & (state.occupancy > 0))[top : top + n, left : left + n]
+    return occupancy.fine_obstacles(params.occupancy, occupied, state.surface)
 
 
 def local_map(spec: FilterSpec, state: FilterState) -> LocalMap:
@@ -124,7 +144,7 @@ def observe(
     state = move(spec, params, state, pose[:2])
     origin = geometry.window_origin(state.corner, spec.grid)
     resolution = spec.grid.resolution
-    hit, crossed, within = occupancy.observed(
+    hit, crossed = occupancy.observed(
         params.occupancy,
         spec.grid.shape,
         origin,
@@ -134,7 +154,12 @@ def observe(
         point_valid,
         spec.num_bearings,
     )
-    surface = occupancy.refine(state.surface, state.occupancy, hit, within)
+    top, left = local_corner(spec)
+    corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
+    returns = occupancy.fine_returns(
+        params.occupancy, state.surface.shape, corner, resolution / 2, pose, points, point_valid, spec.num_bearings
+    )
+    surface = occupancy.refine(state.surface, returns)
     belief, seen = occupancy.apply(
         params.occupancy, state.occupancy, state.seen, origin, resolution, pose, hit, crossed
     )

@@ -114,11 +114,10 @@ def observed(
     points: Float[Array, "P 3"],
     point_valid: Bool[Array, " P"],
     num_bearings: int = 180,
-) -> tuple[Bool[Array, "H W"], Bool[Array, "H W"], Float[Array, "H W 2"]]:
-    """Cells in which a return of this scan lies, cells that its rays have crossed, and where in its cell each return lies.
+) -> tuple[Bool[Array, "H W"], Bool[Array, "H W"]]:
+    """Cells in which a return of this scan lies, and cells that its rays have crossed.
 
-    The union of the two masks is what the scan has seen; no cell is in both. The last output is the mean place (x, y) of
-    the returns in a cell relative to its centre [cells], 0 where there is none.
+    Their union is what the scan has seen; no cell is in both.
 
     Args:
         params: Sensor model.
@@ -136,20 +135,11 @@ def observed(
     around = jnp.concatenate([clear[-1:], clear, clear[:1]])
     least = jax.lax.reduce_window(around, jnp.inf, jax.lax.min, (3,), (1,), "VALID")
 
-    h, w = shape
-    xy = geometry.transform(pose, jnp.where(returned[:, None], points[:, :2], 0.0))
-    cell = jax.vmap(geometry.cell_of, (0, None, None))(xy, origin, resolution)
-    flat_index = jnp.where(returned & geometry.inside(cell, shape), cell[:, 0] * w + cell[:, 1], h * w)
-    place_x, place_y = (
-        (xy[:, a] - origin[a]) / resolution - cell[:, 1 - a].astype(jnp.float32) - 0.5 for a in (0, 1)
-    )
-    counted = jnp.stack([jnp.ones_like(place_x), place_x, place_y], axis=-1)
-    total = jnp.zeros((h * w, 3), jnp.float32).at[flat_index].add(counted, mode="drop").reshape(h, w, 3)
+    total = _count(shape, origin, resolution, pose, points, returned)
     # range noise throws a few of the many returns of a near wall into the cells before it: those are no wall
-    peak = jax.lax.reduce_window(total[..., 0], 0.0, jax.lax.max, (3, 1), (1, 1), "SAME")
+    peak = jax.lax.reduce_window(total, 0.0, jax.lax.max, (3, 1), (1, 1), "SAME")
     peak = jax.lax.reduce_window(peak, 0.0, jax.lax.max, (1, 3), (1, 1), "SAME")
-    hit = (total[..., 0] > 0) & (total[..., 0] >= params.min_share * peak)
-    within = total[..., 1:] / jnp.maximum(total[..., :1], 1.0)
+    hit = (total > 0) & (total >= params.min_share * peak)
 
     x, y = geometry.cell_centres(shape, origin, resolution)
     dx, dy = jnp.broadcast_arrays(x - pose[0], y - pose[1])
@@ -162,7 +152,7 @@ def observed(
     index = jnp.clip(place.astype(jnp.int32), 0, num_bearings - 1)
     limit = least.at[index].get(mode="promise_in_bounds")
     limit = jnp.maximum(limit - params.margin * resolution, params.body_radius)
-    return hit, (dx * dx + dy * dy < jnp.square(limit)) & (total[..., 0] == 0), within
+    return hit, (dx * dx + dy * dy < jnp.square(limit)) & (total == 0)
 
 
 @partial(jax.jit, static_argnames="num_bearings")
@@ -195,7 +185,7 @@ def update(
         The new `(occupancy, seen)`.
     """
     h, w = occupancy.shape
-    hit, crossed, _ = observed(params, (h, w), origin, resolution, pose, points, point_valid, num_bearings)
+    hit, crossed = observed(params, (h, w), origin, resolution, pose, points, point_valid, num_bearings)
     return apply(params, occupancy, seen, origin, resolution, pose, hit, crossed)
 
 
@@ -221,30 +211,59 @@ def apply(
     return jnp.where(hit, raised, value), seen | hit | crossed
 
 
-def refine(
-    surface: Float[Array, "H W 2"],
-    occupancy: Float[Array, "H W"],
-    hit: Bool[Array, "H W"],
-    within: Float[Array, "H W 2"],
-    rate: float = 0.25,
-) -> Float[Array, "H W 2"]:
-    """Where in its cell the surface lies: a running mean of where returns fell, finer than the cell.
+def fine_returns(
+    params: OccupancyParams,
+    shape: tuple[int, int],
+    origin: Float[Array, "2"],
+    resolution: Scalar,
+    pose: Float[Array, "3"],
+    points: Float[Array, "P 3"],
+    point_valid: Bool[Array, " P"],
+    num_bearings: int = 180,
+) -> Float[Array, "h w"]:
+    """Number of in-band returns of a scan in each cell of a grid; arguments as in `observed`."""
+    _, returned = clear_ranges(params, points, point_valid, num_bearings)
+    return _count(shape, origin, resolution, pose, points, returned)
+
+
+def _count(
+    shape: tuple[int, int], origin: Array, resolution: Scalar, pose: Array, points: Array, returned: Array
+) -> Float[Array, "h w"]:
+    h, w = shape
+    xy = geometry.transform(pose, jnp.where(returned[:, None], points[:, :2], 0.0))
+    cell = geometry.cell_of(xy, origin, resolution)
+    index = jnp.where(returned & geometry.inside(cell, shape), cell[:, 0] * w + cell[:, 1], h * w)
+    return jnp.zeros(h * w, jnp.float32).at[index].add(1.0, mode="drop").reshape(h, w)
+
+
+def refine(surface: Float[Array, "h w"], returns: Float[Array, "h w"], rate: float = 0.2) -> Float[Array, "h w"]:
+    """Share of a cell's returns that fall into each of its quarters: a running mean over the scans that saw it.
 
     Args:
-        surface: So far, relative to the cell's centre [cells].
-        occupancy: Log-odds before this scan: a cell that was not held to be occupied starts afresh.
-        hit: Cells with a return in this scan.
-        within: Mean place of these (`observed`).
+        surface: So far, on cells of half the map's edge, 0..1.
+        returns: Of this scan, on the same cells.
         rate: Weight of one scan.
     """
-    gain = jnp.where(hit, jnp.where(occupancy > 0, rate, 1.0), 0.0)[..., None]
-    return surface + gain * (within - surface)
+    h, w = returns.shape
+    blocks = returns.reshape(h // 2, 2, w // 2, 2)
+    total = jnp.sum(blocks, axis=(1, 3), keepdims=True)
+    share = (blocks / jnp.maximum(total, 1.0)).reshape(h, w)
+    seen = jnp.broadcast_to(total > 0, blocks.shape).reshape(h, w)
+    return surface + jnp.where(seen, rate, 0.0) * (share - surface)
 
 
-def fine_obstacles(occupied: Bool[Array, "H W"], surface: Float[Array, "H W 2"]) -> Bool[Array, "2*H 2*W"]:
-    """Obstacles on cells of half the edge: of each occupied cell the quarter in which its surface lies."""
+def fine_obstacles(
+    params: OccupancyParams, occupied: Bool[Array, "H W"], surface: Float[Array, "h w"]
+) -> Bool[Array, "h w"]:
+    """Obstacles on cells of half the edge: the quarters of occupied cells into which returns fall.
+
+    Args:
+        params: `min_share` is the share from which on a quarter counts.
+        occupied: Map cells held to be occupied.
+        surface: `refine` on the same area, half the edge.
+    """
     h, w = occupied.shape
-    quarter = jnp.arange(2)
-    north = (surface[..., 1] > 0).astype(jnp.int32)[:, None, :, None] == quarter[None, :, None, None]
-    east = (surface[..., 0] > 0).astype(jnp.int32)[:, None, :, None] == quarter[None, None, None, :]
-    return (occupied[:, None, :, None] & north & east).reshape(2 * h, 2 * w)
+    quarters = (surface >= params.min_share * 0.5).reshape(h, 2, w, 2)
+    # a cell that became occupied before it came this near is solid until its quarters are known
+    known = jnp.any(quarters, axis=(1, 3), keepdims=True)
+    return (occupied[:, None, :, None] & (quarters | ~known)).reshape(2 * h, 2 * w)

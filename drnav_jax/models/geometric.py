@@ -39,7 +39,7 @@ def _box_mean(values: Float[Array, "H W"], half: int) -> Float[Array, "H W"]:
     n = 2 * half + 1
     table = jnp.cumsum(jnp.cumsum(jnp.pad(values, ((n, half), (n, half))), axis=0), axis=1)
     total = table[n:, n:] - table[:-n, n:] - table[n:, :-n] + table[:-n, :-n]
-    return total[:h, :w] / (n * n)
+    return total[half : half + h, half : half + w] / (n * n)
 
 
 @partial(jax.jit, static_argnames=())

@@ -180,5 +180,5 @@ def update(
         place=place,
         target=jnp.where(retreat, refuge, state.target),
         entries=state.entries + enter.astype(jnp.int32),
-        visits=jnp.minimum(visits + here * jnp.where(stamp, 1.0, params.visit_driven * driven), 1.0),
+        visits=jnp.minimum(visits + jnp.where(here, jnp.where(stamp, 1.0, params.visit_driven * driven), 0.0), 1.0),
     )

@@ -44,8 +44,8 @@ class RouteSpec:
 class RouteParams(NamedTuple):
     """What the route costs."""
 
-    closed_margin: Scalar = 0.08  # [] beyond the radius: cells with less clearance are closed [m]
-    squeeze_margin: Scalar = 0.05  # [] the same, once no way was found at `closed_margin` [m]
+    closed_margin: Scalar = 0.06  # [] beyond the radius: cells with less clearance are closed [m]
+    squeeze_margin: Scalar = 0.04  # [] the same, once no way was found at `closed_margin` [m]
     clearance: Scalar = 1.0  # [] w_o
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
     risk_weight: Scalar = 3.0  # [] lambda inside the cell cost

@@ -235,7 +235,7 @@ def run(
         mine = jax.tree.map(lambda a: jnp.asarray(a)[index], (params, keys))
         state = _start_batch(spec, policy, *mine)
         logs = []
-        while bool(jnp.any(state.active)) and not stop.is_set():
+        while not logs or (bool(jnp.any(state.active)) and not stop.is_set()):
             state, log = _chunk_batch(spec, policy, mine[0], state)
             logs.append(jax.device_get(log))
             done[which] = int(np.sum(~np.asarray(state.active)))

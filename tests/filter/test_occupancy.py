@@ -138,7 +138,7 @@ def test_masks_equal_plain_loops(seed):
     shape, pose = (44, 60), rng.uniform([-1, -1, -4], [1, 1, 4]).astype(np.float32)
     points, valid = random_points(rng)
     origin = window(shape)
-    hit, crossed, _ = occupancy.observed(
+    hit, crossed = occupancy.observed(
         PARAMS,
         shape,
         origin,
@@ -169,7 +169,7 @@ def test_equals_octomap():
         pose = jnp.asarray(rng.uniform([0.5, 0.5, -3], [1.5, 1.9, 3]), jnp.float32)
         points = scan(box(0.25, 0.25, 1.75, 2.15), pose, LEVEL, noise=rng)
         args = (origin, RESOLUTION, pose, points, everything(points))
-        hit, crossed, _ = (np.asarray(m) for m in occupancy.observed(params, shape, *args))
+        hit, crossed = (np.asarray(m) for m in occupancy.observed(params, shape, *args))
         belief, seen = occupancy.update(params, belief, seen, *args)
         for i, j in zip(*np.nonzero(hit | crossed), strict=True):
             tree.updateNode(np.array([x[i, j], y[i, j], 0.05]), bool(hit[i, j]))
@@ -197,7 +197,7 @@ def test_clears_what_is_in_sight_and_nothing_else(seed):
     pose = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(-3, 3)], np.float32)
     origin = window(shape)
     points = scan(segments, pose)
-    _, crossed, _ = occupancy.observed(PARAMS, shape, origin, RESOLUTION, jnp.asarray(pose), points, everything(points))
+    _, crossed = occupancy.observed(PARAMS, shape, origin, RESOLUTION, jnp.asarray(pose), points, everything(points))
     crossed = np.asarray(crossed)
     x, y = centres(shape, origin)
     # Each cell's own line of sight, in the continuous world.
