@@ -9,7 +9,7 @@ import re
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, TextIO
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import tyro
@@ -160,14 +160,13 @@ def parse(argv: list[str]) -> Run | Compare | Bench:
 
 def _one_line(box: str) -> str:
     """The gist of tyro's framed message: its first paragraph, and the flags it suggests."""
-    lines = [line.strip(" │|") for line in box.splitlines()]
-    lines = [line for line in lines if line and not line.startswith(("╭", "╰", "+--"))]
-    rules = [k for k, line in enumerate(lines) if set(line) <= {"─", "-"}]
-    first = " ".join(lines[: rules[0]] if rules else lines).rstrip(".")
-    if any(line.startswith("Perhaps you meant") for line in lines):
-        flags = dict.fromkeys(re.findall(r"^--[a-z-]+", "\n".join(lines), re.M))
-        first += f"; perhaps you meant {' or '.join(flags)}"
-    where = next((w for line in lines if (w := re.search(r"drnav[ a-z]* --help", line))), None)
+    lines = [line.strip(" │") for line in box.splitlines() if not line.startswith(("╭", "╰"))]
+    paragraphs = [" ".join(part.split("\n")).strip() for part in re.split(r"\n[─-]+\n", "\n".join(lines))]
+    first = paragraphs[0 if box.startswith("╭") or len(paragraphs) == 1 else 1].rstrip(".")  # plain boxes: the title
+    if "Perhaps you meant" in box:
+        flags = [line.split()[0] for line in lines if re.match("--[a-z]", line)]
+        first += f"; perhaps you meant {' or '.join(dict.fromkeys(flags))}"
+    where = re.search(r"drnav[ a-z]* --help", box)
     return f"{first}; see {where[0] if where else 'drnav --help'}"
 
 
@@ -215,10 +214,10 @@ def _command(args: Run | Compare) -> str:
 class Bar:
     """A progress bar on a terminal; one line when all is over elsewhere."""
 
-    def __init__(self, name: str, total: int, stream: TextIO) -> None:
+    def __init__(self, name: str, total: int) -> None:
         """Show that it has begun."""
-        self.name, self.total, self.stream = name, total, stream
-        self.done, self.begin, self.live = 0, time.perf_counter(), stream.isatty()
+        self.name, self.total, self.stream = name, total, sys.stderr
+        self.done, self.begin, self.live = 0, time.perf_counter(), sys.stderr.isatty()
         self._show("compiling")
 
     def _show(self, note: str) -> None:
@@ -245,7 +244,7 @@ def drive(trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup]) -> Fini
     """Drive every planner; an interrupt keeps the episodes that are finished."""
     evaluations: dict[str, evaluate.Evaluation] = {}
     for name, setup in setups.items():
-        bar = Bar(name, len(trips), sys.stderr)
+        bar = Bar(name, len(trips))
         try:
             evaluations[name] = evaluate.evaluate(trips, setup, progress=bar, spec=SPEC)
         except KeyboardInterrupt:

@@ -52,7 +52,7 @@ def centre_of(cell: Int[Array, "*s 2"], origin: Float[Array, "2"], resolution: S
 
 
 def cell_centres(shape: tuple[int, int], origin: Float[Array, "2"], resolution: Scalar) -> tuple[Array, Array]:
-    """x `[1, W]` and y `[H, 1]` of all cell centres [m]; they broadcast to `[H, W]`."""
+    """X `[1, W]` and y `[H, 1]` of all cell centres [m]; they broadcast to `[H, W]`."""
     x = origin[0] + (jnp.arange(shape[1], dtype=jnp.float32) + 0.5) * resolution
     y = origin[1] + (jnp.arange(shape[0], dtype=jnp.float32) + 0.5) * resolution
     return x[None, :], y[:, None]

@@ -37,11 +37,16 @@ def distance_transform(mask: Bool[Array, "H W"], resolution: float, max_distance
     """
     h, w = mask.shape
     n = int(max_distance / resolution + 1e-6)
-    # in whole cells: XLA vectorises the least of integers far better than that of floats
-    along = jnp.where(mask, jnp.int32(0), jnp.int32(n + 1))
-    for reach in (2**k for k in range(n.bit_length())):  # then distances below 2 * reach are right
-        padded = jnp.pad(along, ((0, 0), (reach, reach)), constant_values=n + 1)
-        along = jnp.minimum(along, jnp.minimum(padded[:, :w], padded[:, 2 * reach :]) + reach)
+
+    def double(k: Array, along: Array) -> Array:
+        reach = jnp.int32(1) << k  # distances below `reach` are right, then those below 2 * reach
+        padded = jnp.pad(along, ((0, 0), (n, n)), constant_values=n + 1)
+        left, right = (jax.lax.dynamic_slice(padded, (0, n + by), (h, w)) for by in (-reach, reach))
+        return jnp.minimum(along, jnp.minimum(left, right) + reach)
+
+    # In whole cells: XLA vectorises the least of integers far better than that of floats. In a loop: unrolled, XLA
+    # would fuse the stages, and whatever makes the mask, into one and compute them over and over.
+    along = jax.lax.fori_loop(0, n.bit_length(), double, jnp.where(mask, jnp.int32(0), jnp.int32(n + 1)))
     squares = along * along
     padded = jnp.pad(squares, ((n, n), (0, 0)), constant_values=(n + 1) ** 2)
     for k in range(1, n + 1):

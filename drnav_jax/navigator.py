@@ -281,7 +281,8 @@ def _act(
     window = belief.local_map(spec.filter, state.belief)
     local, field = rollout_field(spec, params, state)
 
-    recover = state.recovery
+    arrived = jnp.hypot(seen.goal[0] - pose[0], seen.goal[1] - pose[1]) <= params.goal_tolerance
+    recover = behaviour.wait(state.recovery, time, arrived | ~healthy)
     heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)
     squeeze = time < state.squeeze_until
     narrow = jnp.minimum(params.route.squeeze_margin, params.score.margin)
@@ -307,7 +308,6 @@ def _act(
     track = tracker.track(
         spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, recover.mode == behaviour.CLEAR
     )
-    arrived = jnp.hypot(seen.goal[0] - pose[0], seen.goal[1] - pose[1]) <= params.goal_tolerance
     halt = arrived | ~healthy | (recover.mode == behaviour.STOP)
     stop = dynamics.limit(0.0, 0.0, twist, robot, spec.dt)
     command = jax.tree.map(lambda a, b: jnp.where(halt, a, b), stop, track.command)

@@ -94,7 +94,7 @@ def wrap(angle):
 
 
 def rollout(pose, twist, v_target, w_target, robot, dt, steps):
-    """Poses and speeds `[(x, y, yaw, v, omega)]` of a unicycle that tends to the target speeds, by the midpoint rule."""
+    """`[(x, y, yaw, v, omega)]` of a unicycle that tends to the target speeds, by the midpoint rule."""
     x, y, yaw = map(float, pose)
     v, w = map(float, twist)
     out = []

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from hypothesis import given, settings
 from scipy import ndimage
 
+import reference
 from drnav_jax import grids
 
 RESOLUTION = 0.2

@@ -1,9 +1,9 @@
 """Dead ends without learning: what geometry alone implies.
 
 A known free cell is a dead end if from it no walk over known free cells reaches a frontier (free next to unknown), the
-window's edge or the goal without passing the robot: whatever lies behind the robot is cut off by its own body. Elsewhere
-the rule only says that the cell is not shown to be one, which is weak evidence for being open, and none at all where
-little has been seen. It works on cells of twice the map's size, in the configuration space of a disc.
+window's edge or the goal without passing the robot: whatever lies behind the robot is cut off by its own body. For
+other cells the rule only says that they are not shown to be one, which is weak evidence for being open, and none at all
+where little has been seen. It works on cells of twice the map's size, in the configuration space of a disc.
 """
 
 from functools import partial
@@ -27,7 +27,7 @@ class GeometricParams(NamedTuple):
     margin: Scalar = 0.05  # [] beyond the radius: closer to an obstacle is not free [m]
     body: Scalar = 0.6  # [] radius of the disc by which the robot cuts the free space [m]
     range: Scalar = 8.0  # [] cells farther from the robot get no verdict [m]
-    p_dead: Scalar = 0.8  # [] p̂ of cells behind which nothing is left
+    p_dead: Scalar = 0.25  # [] p̂ of cells behind which nothing is left: mostly they are only not seen well enough
     p_open: Scalar = 0.03  # [] p̂ of the other free cells
     open_confidence: Scalar = 0.2  # [] weight of "not shown to be a dead end"
     seen_share: Scalar = 0.6  # [] share of seen cells around a cell from which on it counts as well seen

@@ -25,7 +25,8 @@ def predict(params: OracleParams, observation: Observation, local_map: LocalMap)
         observation: Only its pose is used.
         local_map: Where the window lies.
     """
-    x, y = geometry.cell_centres(local_map.occupancy.shape, local_map.origin, local_map.resolution)
+    h, w = local_map.occupancy.shape
+    x, y = geometry.cell_centres((h, w), local_map.origin, local_map.resolution)
     xy = jnp.stack(jnp.broadcast_arrays(x, y), axis=-1)
     label = geometry.sample_nearest(params.label, xy, fill=0.0)
     near = jnp.square(x - observation.pose[0]) + jnp.square(y - observation.pose[1]) <= jnp.square(params.reach)

@@ -5,8 +5,7 @@ Along a path with arc length s and discount w(s) = exp(-decay s):
     EDE(path) = sum_k w_k P_dead^foot(c_k)                              (discrete)
     EDE(path) = integral_0^L w(s) P_dead^foot(x(s)) ds                  (continuous)
 
-The sum depends on the step of the path, the integral does not; planners use the integral. Both are differentiable in the
-path and in the map. A robot that stands or turns on the spot moves along no arc and would be exposed to nothing; the
+The sum depends on the step of the path, the integral does not. Both are differentiable in the path and in the map. A robot that stands or turns on the spot moves along no arc and would be exposed to nothing; the
 integral charges it P^foot times an equivalent length per second instead.
 """
 
@@ -22,14 +21,14 @@ from drnav_jax.types import GridMap, Scalar
 STANDING_SPEED = 0.25  # [m/s] equivalent length per second of standing still
 
 
-def arc_lengths(path: Float[Array, "T 2"]) -> Float[Array, "T"]:
+def arc_lengths(path: Float[Array, "T 2"]) -> Float[Array, " T"]:
     """Arc length s_k [m] at each point; 0 at the first."""
     step = jnp.sqrt(jnp.sum(jnp.square(path[1:] - path[:-1]), axis=-1) + 1e-12)  # smooth where points coincide
     return jnp.concatenate([jnp.zeros(1, path.dtype), jnp.cumsum(step)])
 
 
 @jax.jit
-def exposure_sum(risk: Float[Array, "T"], arc: Float[Array, "T"], decay: Scalar) -> Float[Array, ""]:
+def exposure_sum(risk: Float[Array, " T"], arc: Float[Array, " T"], decay: Scalar) -> Float[Array, ""]:
     """The paper's discrete sum over the cells of a path.
 
     Args:

@@ -106,7 +106,7 @@ def candidates(
         w=join(w, none),
         turned=join(one, jnp.abs(geometry.wrap_angle(yaw - pose[2]))),
         reach=join(one + params.range_max, reach),
-        bias=join(one, none.at[fan].set(-held)),
+        bias=join(one + params.curved, none.at[fan].set(-held)),
     )
 
 

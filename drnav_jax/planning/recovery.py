@@ -100,6 +100,15 @@ def choose(
     return jnp.where(jnp.isfinite(worth[best]), points[best], xy), jnp.isfinite(worth[best])
 
 
+def wait(state: RecoveryState, time: Scalar, waiting: Bool[Array, ""]) -> RecoveryState:
+    """While `waiting` the clocks start anew: a robot that stands still for a reason (arrived, no pose) is not stuck."""
+    now = lambda clock: jnp.where(waiting, time, clock)  # noqa: E731
+    return state._replace(
+        anchor_time=now(state.anchor_time), circle_time=now(state.circle_time), free_time=now(state.free_time),
+        way_time=now(state.way_time),
+    )  # fmt: skip
+
+
 @partial(jax.jit, static_argnames="spec")
 def update(
     spec: GridSpec,

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from drnav_jax.sim import contact, kinematic, lidar
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
-from drnav_jax.types import Command, Observation, RobotParams, Scalar, empty_observation
+from drnav_jax.types import Command, Observation, RobotParams, empty_observation
 from drnav_jax.worlds.world import World
 
 
@@ -140,7 +140,7 @@ def tick(
     from_goal = jnp.hypot(state.pose[0] - params.goal[0], state.pose[1] - params.goal[1])
     moved = jnp.hypot(pose[0] - state.pose[0], pose[1] - state.pose[1])
     arrived = (to_goal <= params.goal_tolerance) & ~hit
-    late = (state.tick + 1) * spec.dt >= params.time_limit
+    late = (state.tick + 1).astype(jnp.float32) * spec.dt >= params.time_limit
     going = state.active
     new = EpisodeState(
         pose=pose, odometry=odometry, twist=twist, policy=mind, key=state.key, tick=state.tick + 1,
@@ -174,7 +174,7 @@ def chunk(
 
 
 @partial(jax.jit, static_argnames=("spec", "policy"))
-def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: PRNGKeyArray) -> EpisodeState:
+def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: Key[Array, " B"]) -> EpisodeState:
     return jax.lax.map(lambda a: start(policy, *a), (params, keys), batch_size=spec.lanes)
 
 
@@ -208,7 +208,7 @@ def run(
     spec: EpisodeSpec,
     policy: Policy,
     params: EpisodeParams,
-    keys: PRNGKeyArray,
+    keys: Key[Array, " B"],
     *,
     workers: int = 2,
     progress: Callable[[int], None] | None = None,

@@ -142,5 +142,6 @@ def test_one_trace_and_a_batch_equals_single_calls():
     observe = lambda x: empty_observation(0)._replace(pose=jnp.stack([x, 0 * x, x]), goal=f32(FAR))  # noqa: E731
     places = f32([4.0, 5.0, 7.0])
     one = [once(PARAMS._replace(body=f32(0.5 + 0.1 * k)), observe(x), held) for k, x in enumerate(places)]
-    many = jax.vmap(lambda b, x: geometric.predict(PARAMS._replace(body=b), observe(x), held))(f32([0.5, 0.6, 0.7]), places)
+    predict = jax.vmap(lambda body, x: geometric.predict(PARAMS._replace(body=body), observe(x), held))
+    many = predict(f32([0.5, 0.6, 0.7]), places)
     chex.assert_trees_all_close(jax.tree.map(lambda *a: jnp.stack(a), *one), many, atol=1e-6)

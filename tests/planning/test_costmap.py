@@ -6,10 +6,10 @@ import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
-import reference
 from hypothesis import given
 from scipy import ndimage
 
+import reference
 from drnav_jax.planning import costmap
 from drnav_jax.planning.costmap import CLEARANCE_STEP, VALUE_STEP, InflationParams
 

@@ -6,9 +6,9 @@ import hypothesis.strategies as st
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from hypothesis import given, settings
 
+import reference
 from drnav_jax.planning import dynamics
 from drnav_jax.types import RobotParams
 

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy import ndimage
 
+import reference
 from drnav_jax.planning import costmap, goal_generator, scoring
 from drnav_jax.planning.goal_generator import GeneratorSpec
 from drnav_jax.planning.scoring import BLOCKED, ScoreParams

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 
+import reference
 from drnav_jax import grids
 from drnav_jax.planning import memory
 from drnav_jax.planning.memory import MemorySpec

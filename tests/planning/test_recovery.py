@@ -216,6 +216,14 @@ def test_hopeless_it_stops_and_a_way_sets_it_going():
         assert run.tick(way=False) == DRIVE
 
 
+def test_waiting_is_not_being_stuck():
+    run = Run()
+    for _ in range(600):
+        run.state = recovery.wait(run.state, f32(run.time), jnp.asarray(True))
+        assert run.tick(free=False, way=False) == DRIVE
+    assert run.until(CLEAR) == pytest.approx(PARAMS.stuck_time, abs=3 * DT), "then the clocks begin"
+
+
 def test_the_refuge_is_open_near_and_not_yet_visited():
     points = f32([[2.0, 0.0], [0.0, 4.0], [0.3, 0.0], [-3.0, 0.0]])
     rank, valid = f32([2, 5, 6, 2]), jnp.asarray([True, True, True, True])
@@ -235,9 +243,9 @@ def test_one_trace_and_a_batch_equals_single_calls():
 
     def args(k):
         return dict(
-            state=recovery.init(SPEC, f32([0, 0])), time=f32(3.0 * k), dt=f32(0.1), xy=f32([0.2 * k, 0]), driven=f32(0.1 * k), origin=f32(ORIGIN),
-            candidate_free=jnp.asarray(k == 1), has_way=jnp.asarray(k != 2), refuge=f32([1, 1]),
-            has_refuge=jnp.asarray(True), params=PARAMS._replace(stuck_time=f32(4.0 + k)),
+            state=recovery.init(SPEC, f32([0, 0])), time=f32(3.0 * k), dt=f32(0.1), xy=f32([0.2 * k, 0]),
+            driven=f32(0.1 * k), origin=f32(ORIGIN), candidate_free=jnp.asarray(k == 1), has_way=jnp.asarray(k != 2),
+            refuge=f32([1, 1]), has_refuge=jnp.asarray(True), params=PARAMS._replace(stuck_time=f32(4.0 + k)),
         )  # fmt: skip
 
     one = [once(SPEC, **args(k)) for k in range(3)]

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy import ndimage
 
+import reference
 from drnav_jax import grids
 from drnav_jax.planning import route
 from drnav_jax.planning.route import RouteParams, RouteSpec
@@ -38,7 +38,9 @@ def centres():
 X, Y = centres()
 
 
-def solve(occupied, goal, xy=(-4.0, 0.0), params=PLAIN, risk=NONE, visits=NONE, squeeze=False, beyond=0.0, solver=solve_):
+def solve(
+    occupied, goal, xy=(-4.0, 0.0), params=PLAIN, risk=NONE, visits=NONE, squeeze=False, beyond=0.0, solver=solve_
+):
     clear = np.full(SHAPE, 1.0)
     if occupied.any():
         clear = np.minimum(ndimage.distance_transform_edt(~occupied) * RESOLUTION, 1.0)
@@ -100,7 +102,8 @@ def test_it_equals_dijkstra_on_the_pooled_cells():
     for i, j in np.ndindex(h, w):
         block = np.s_[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
         away = np.hypot(*(np.array([X[block].mean(), Y[block].mean()]) - goal))
-        lack = (ROBOT.radius + PARAMS.soft_clearance - clear[block].mean()) / (PARAMS.soft_clearance - PARAMS.closed_margin)
+        lack = ROBOT.radius + PARAMS.soft_clearance - clear[block].mean()
+        lack /= PARAMS.soft_clearance - PARAMS.closed_margin
         if free[block].any():
             cost[i, j] = 1 + PARAMS.clearance * max(lack, 0) ** 2 + PARAMS.visit_weight * visits[block].mean()
             cost[i, j] += min(PARAMS.risk_weight * risk[block].mean(), PARAMS.risk_cap)

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import reference
 from scipy import ndimage
 
+import reference
 from drnav_jax.planning import costmap, scoring
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.planning.exposure import STANDING_SPEED
@@ -144,7 +144,8 @@ def test_through_a_wall_is_blocked_and_short_of_it_costs_the_collision():
     dear = run(pack(clear, 0 * clear, value), candidates, PARAMS._replace(collision=1.1))
     assert float(dear.score[0] - stopped.score[0]) == pytest.approx(1.0, abs=TOLERANCE)
     # what lies beyond the horizon is not met
-    soon = [run(pack(clear, 0 * clear, value), candidates, PARAMS._replace(horizon=1.0, collision=w)) for w in (0.0, 7.0)]
+    near = PARAMS._replace(horizon=1.0)
+    soon = [run(pack(clear, 0 * clear, value), candidates, near._replace(collision=w)) for w in (0.0, 7.0)]
     chex.assert_trees_all_equal(*soon)
     assert float(soon[0].x[0]) == pytest.approx(1.0, abs=1e-4)
 
@@ -225,4 +226,5 @@ def test_one_trace_for_a_sweep_over_weights():
     assert len(seen) == 3
     sweep = jax.vmap(lambda lam: run(world(1), population(1), PARAMS._replace(risk_weight=lam)).score)(f32([0, 1, 4]))
     for lam, row in zip((0.0, 1.0, 4.0), sweep, strict=True):
-        chex.assert_trees_all_close(row, run(world(1), population(1), PARAMS._replace(risk_weight=lam)).score, atol=1e-5)
+        one = run(world(1), population(1), PARAMS._replace(risk_weight=lam)).score
+        chex.assert_trees_all_close(row, one, atol=1e-5)

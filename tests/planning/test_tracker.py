@@ -16,8 +16,8 @@ ROBOT, PARAMS = RobotParams(), TrackerParams()
 DT = SPEC.dt
 SHAPE, RESOLUTION, ORIGIN = (70, 90), 0.05, np.array([-2.0, -1.5], np.float32)
 LIMIT = ROBOT.radius + PARAMS.margin
-# Clearance falls by at most one metre per metre, and the certificate looks every dt / samples: in between it may be lower
-# by half of that way, and arcs are driven as chords. What is left is above the radius.
+# Clearance falls by at most one metre per metre, and the certificate looks every dt / samples: in between it may be
+# lower by half of that way, and arcs are driven as chords. What is left is above the radius.
 BETWEEN = 0.5 * ROBOT.v_max * DT / SPEC.samples + 1e-3
 STATES = 200
 
@@ -108,7 +108,8 @@ def test_commands_are_within_the_limits(clutter):
     got = track_all(SPEC, PARAMS, ROBOT, clutter, pose, twist, target, jnp.zeros(STATES, bool))
     v, w = np.asarray(got.command.v), np.asarray(got.command.omega)
     tiny = 1e-6
-    assert (v >= ROBOT.v_min - tiny).all() and (v <= ROBOT.v_max + tiny).all() and (np.abs(w) <= ROBOT.w_max + tiny).all()
+    assert (v >= ROBOT.v_min - tiny).all() and (v <= ROBOT.v_max + tiny).all()
+    assert (np.abs(w) <= ROBOT.w_max + tiny).all()
     assert (np.abs(v - twist[:, 0]) <= ROBOT.a_max * DT + tiny).all()
     assert (np.abs(w - twist[:, 1]) <= ROBOT.alpha_max * DT + tiny).all()
 
@@ -201,6 +202,7 @@ def test_one_trace_and_a_batch_equals_single_calls(clutter):
     many = track_all(SPEC, PARAMS, ROBOT, clutter, pose, twist, target, jnp.zeros(STATES, bool))
     for k in range(12):
         robot = ROBOT._replace(v_max=f32(ROBOT.v_max))
-        one = once(SPEC, PARAMS._replace(heading=f32(1.0)), robot, clutter, *(f32(a[k]) for a in (pose, twist, target)), no)
+        params, where = PARAMS._replace(heading=f32(1.0)), [f32(a[k]) for a in (pose, twist, target)]
+        one = once(SPEC, params, robot, clutter, *where, no)
         assert bool(one.certified) == bool(many.certified[k])
         np.testing.assert_allclose(one.command, [many.command.v[k], many.command.omega[k]], atol=1e-5)

@@ -1,0 +1,235 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from drnav_jax import cli, evaluate, report
+from drnav_jax.viz import MissingExtra
+
+ROOT = Path(__file__).resolve().parents[1]
+EPISODE = {
+    "success", "collision", "timeout", "time_s", "optimal_s", "distance_m", "shortest_m", "straight_m", "efficiency",
+    "spl", "mean_speed_mps", "npr", "min_clearance_m", "recoveries", "world",
+}  # fmt: skip
+SHORT = ["--world", "u:0", "--episodes", "2", "--time-limit", "2"]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def call(capsys, *argv) -> tuple[int, str, str]:
+    code = cli.main([str(word) for word in argv])
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def shell(*argv, **kwargs):
+    env = os.environ | {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache")}
+    command = [sys.executable, "-m", "drnav_jax.cli", *argv]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("", "run, compare, bench"),
+        ("drive", "Unrecognized options: drive"),
+        ("run", "exactly one of"),
+        ("run --wurld u:0", "perhaps you meant --world"),
+        ("run --world", "--world"),
+        ("run --world u", "FAMILY:SEED"),
+        ("run --world u:0 --map m.yaml", "got --world and --map"),
+        ("run --world u:0 --planner teb", 'no planner "teb": choose from drnav, '),
+        ("run --world u:0 --planners drnav", "--planners"),
+        ("compare --world u:0 --planners drnav,", 'no planner ""'),
+        ("compare --world u:0 --planners dwa,grid,dwa", "names one twice"),
+        ("run --world u:0 --predictor gut", "geometric"),
+        ("run --world u:0 --episodes 1.5", "--episodes"),
+        ("run --world u:0 --robot-radius wide", "--robot-radius"),
+        ("run --world u:0 --robot-radius 0", "robot_radius must lie within"),
+        ("run --world u:0 --max-speed nan", "max_speed"),
+        ("run --world u:0 --risk-weight -1", "risk_weight"),
+        ("run --world u:0 --time-limit 0", "time_limit"),
+        ("run --world u:0 --start 1,2", "--start must be X,Y,YAW"),
+        ("run --world u:0 --start 900,2,0", "the start (900.00, 2.00) is off the map"),
+        ("run --world u:0 --goal -11.9,1.0", "the goal (-11.90, 1.00) is"),
+        ("run --map nowhere.yaml", "no such file"),
+        ("run --map nowhere.png --resolution 0.05", "no such image"),
+        ("run --barn nowhere", "no such file"),
+        ("run --world u:0 --out taken/results", "cannot be written to"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(capsys, argv, message):
+    Path("taken").write_text("a file, no folder")
+    code, out, err = call(capsys, *argv.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("drnav: error: ") and err.count("\n") == 1
+    assert message in err
+    assert not Path("results").exists()
+
+
+def test_unreachable_goal_and_start_in_an_obstacle(capsys):
+    rooms = np.zeros((60, 120), np.uint8)
+    rooms[5:-5, 5:55] = rooms[5:-5, 65:-5] = 255
+    Image.fromarray(rooms).save("rooms.png")
+    image = ("run", "--map", "rooms.png", "--resolution", 0.1)
+    code, _, err = call(capsys, *image, "--start", "2,2,0", "--goal", "9,2")
+    assert code == 2 and "no way from (2.00, 2.00) to (9.00, 2.00)" in err
+    code, _, err = call(capsys, *image, "--start", "6,3,0", "--goal", "9,2")
+    assert code == 2 and "the start (6.00, 3.00) is in an obstacle" in err
+    code, _, err = call(capsys, *image, "--goal", "9,2")
+    assert code == 2 and "both --start and --goal" in err
+
+
+def test_negative_numbers_are_values():
+    args = cli.parse(["run", "--start", "-2,3,1.57", "--goal", "-1.5,-3", "--risk-weight", "-1"])
+    assert (args.start, args.goal, args.risk_weight) == ("-2,3,1.57", "-1.5,-3", -1.0)
+    assert cli.parse(["run", "--start=-2,3,1.57"]).start == "-2,3,1.57"
+
+
+def test_defaults_are_those_of_the_setup():
+    args = cli.parse(["run", "--world", "u:0"])
+    assert cli.setups_of(args) == {"drnav": evaluate.Setup()}
+    args = cli.parse(
+        "compare --planners grid,dwa --predictor oracle --risk-weight 2 --horizon 3 --robot-radius 0.22 --max-speed 2 "
+        "--lidar-range 6 --goal-tolerance 1 --time-limit 100 --seed 5".split()
+    )
+    common = {
+        "predictor": "oracle", "risk_weight": 2.0, "horizon": 3.0, "robot_radius": 0.22, "max_speed": 2.0,
+        "lidar_range": 6.0, "goal_tolerance": 1.0, "time_limit": 100.0, "seed": 5,
+    }  # fmt: skip
+    assert cli.setups_of(args) == {name: evaluate.Setup(planner=name, **common) for name in ("grid", "dwa")}
+
+
+@pytest.mark.parametrize("command", ["", "run", "compare", "bench"])
+def test_help(capsys, command):
+    code, out, err = call(capsys, *command.split(), "--help")
+    assert (code, err) == (0, "")
+    for word in {"": ["run", "compare", "bench"], "bench": ["--quick", "--json"]}.get(
+        command, ["--world FAMILY:SEED", "Footprint radius [m]", "Fastest speed [m/s]", "Time allowed per episode [s]"]
+    ):
+        assert word in out
+    assert max(map(len, out.splitlines())) <= 100
+
+
+def test_version(capsys):
+    assert call(capsys, "--version") == (0, "drnav 0.1.0\n", "")
+
+
+def test_compare_writes_the_same_bytes_again(capsys):
+    flags = ("compare", *SHORT, "--planners", "drnav,dwa", "--json", "--out")
+    code, out, err = call(capsys, *flags, "a")
+    assert code == 0 and "Traceback" not in err
+    found = json.loads(out)  # one object, and nothing else
+    assert out == Path("a/summary.json").read_text()
+    assert list(found["planners"]) == ["drnav", "dwa"]
+    for each in found["planners"].values():
+        assert [e["world"] for e in each["episodes"]] == ["u:0", "u:1"]
+        assert all(EPISODE <= set(e) and e["timeout"] and e["time_s"] == 2.0 for e in each["episodes"])
+        assert each["summary"]["time_to_goal_s"] == each["summary"]["time_limit_s"] == 2.0
+        assert "barn_score" not in each["summary"]
+    assert found["ratios"]["drnav/dwa"] == {"all": {"ratio": 1.0, "low": 1.0, "high": 1.0, "trips": 2},
+                                            "both_solve": None}  # fmt: skip
+    assert found["config"]["world"] == "u:0" and found["time_limit_rule"] == "2 s, as asked for"
+    assert found["interrupted"] is False
+    assert set(os.listdir("a")) == {
+        "summary.json", "timing.json", "trajectory.png", "trajectory-2.png", "belief.gif",
+    }  # fmt: skip
+    with Image.open("a/trajectory.png") as picture, Image.open("a/belief.gif") as film:
+        assert 1000 <= picture.width <= 1400 and film.n_frames == 3
+    timing = json.loads(Path("a/timing.json").read_text())
+    assert timing["planners"]["dwa"]["wall_s"] > 0
+
+    code, again, _ = call(capsys, *flags, "b", "--no-pictures")
+    assert code == 0 and again == out
+    assert Path("a/summary.json").read_bytes() == Path("b/summary.json").read_bytes()
+    assert set(os.listdir("b")) == {"summary.json", "timing.json"}
+
+
+def test_run_prints_a_table_and_cleans_up_after_itself(capsys, monkeypatch):
+    def missing(*_, **__):
+        raise MissingExtra
+
+    monkeypatch.setattr(report.viz, "trajectories", missing)
+    out = Path("results/run-u-0")
+    out.mkdir(parents=True)
+    for name in ("trajectory-5.png", "belief.gif"):
+        (out / name).write_text("of another run")
+    code, text, err = call(capsys, "run", *SHORT, "--planner", "dwa")
+    assert code == 0
+    assert text.splitlines()[2].split()[:4] == ["dwa", "0", "%", "0"]
+    assert "2 episodes each" in text and "mean 2.0 s" in text
+    assert "no pictures: pictures need the extra: pip install drnav_jax[viz]" in err
+    assert "dwa  2/2 episodes in" in err and "\r" not in err
+    assert set(os.listdir(out)) == {"summary.json", "timing.json"}
+    found = json.loads((out / "summary.json").read_text())
+    assert len(found["episodes"]) == found["summary"]["episodes"] == 2
+
+
+def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, monkeypatch):
+    drive = evaluate.evaluate
+
+    def interrupted(trips, setup, **kwargs):
+        if setup.planner == "grid":
+            raise KeyboardInterrupt
+        return drive(trips, setup, **kwargs)
+
+    monkeypatch.setattr(evaluate, "evaluate", interrupted)
+    code, out, err = call(capsys, "compare", *SHORT, "--planners", "dwa,grid,drnav", "--json", "--out", "x")
+    found = json.loads(out)
+    assert code == 130 and "interrupted; what was finished is in x/" in err
+    assert found["interrupted"] is True and list(found["planners"]) == ["dwa"] and found["ratios"] == {}
+    assert out == Path("x/summary.json").read_text()
+    code, out, err = call(capsys, "compare", *SHORT, "--planners", "grid,dwa", "--json", "--out", "y")
+    assert (code, out) == (130, "") and "nothing is written" in err
+
+
+def test_progress_bar_on_a_terminal(monkeypatch):
+    class Terminal:
+        text = ""
+
+        def isatty(self):
+            return True
+
+        def write(self, text):
+            self.text += text
+
+        def flush(self):
+            pass
+
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    bar = cli.Bar("dwa", 4)
+    bar(0)
+    bar(2)
+    bar.close()
+    assert "[############............] 2/4 episodes" in terminal.text and "/s" in terminal.text
+    assert terminal.text.count("\n") == 1 and terminal.text.endswith(" s\n")
+
+
+def test_in_a_shell_mistakes_are_exit_code_2_without_traceback():
+    done = shell("run", "--world", "nowhere:1", "--json")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("drnav: error: unknown family 'nowhere'") and done.stderr.count("\n") == 1
+
+
+def test_in_a_shell_json_is_all_there_is_on_stdout():
+    done = shell("run", *SHORT, "--planner", "dwa", "--json", "--no-pictures", "--out", "z")
+    assert done.returncode == 0, done.stderr
+    assert len(json.loads(done.stdout)["episodes"]) == 2
+    assert done.stdout == Path("z/summary.json").read_text()
+
+
+def test_bench_prints_what_it_measures(capsys, monkeypatch):
+    monkeypatch.setattr(cli.bench, "run", lambda quick=False: {"episodes_per_s": 2.5, "machine": {"quick": quick}})
+    code, out, _ = call(capsys, "bench", "--quick", "--json")
+    assert code == 0 and json.loads(out) == {"episodes_per_s": 2.5, "machine": {"quick": True}}
+    code, out, _ = call(capsys, "bench")
+    assert out.splitlines() == ["episodes_per_s: 2.5", "machine", "  quick: False"]

@@ -1,0 +1,328 @@
+"""The whole robot: it drives, it survives broken sensors, and a batch is what its robots are."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from drnav_jax import navigator
+from drnav_jax.filter import FilterSpec, RecoverySpec
+from drnav_jax.navigator import NavParams, NavSpec
+from drnav_jax.planning import PLANNERS, GeneratorSpec, TrackerSpec
+from drnav_jax.planning import recovery as behaviour
+from drnav_jax.planning.memory import MemorySpec
+from drnav_jax.sim import kinematic, lidar
+from drnav_jax.sim.contact import clearance
+from drnav_jax.sim.lidar import LidarParams, LidarSpec
+from drnav_jax.types import GridSpec, empty_observation
+from drnav_jax.worlds.world import make_world
+
+GRID = GridSpec(shape=(64, 96))
+BEAMS = LidarSpec(rings=2, azimuths=60, elevation_min=-0.02, elevation_max=0.02)
+SPEC = NavSpec(
+    filter=FilterSpec(grid=GRID, num_bearings=60, local_cells=64),
+    generator=GeneratorSpec(num_speeds=3, num_turns=7, num_headings=34),
+    tracker=TrackerSpec(num_speeds=5, num_turns=7),
+    recovery_points=RecoverySpec(grid=GRID, capacity=8, num_directions=12),
+    memory=MemorySpec(cells=32),
+)
+PARAMS = NavParams()
+ROBOT = PARAMS.robot
+KEY = jax.random.key(0)
+GOAL = (6.0, 0.5)
+# float32 in two programs: a sum may be ordered otherwise, and what it decides is compared exactly
+SAME = 1e-5
+
+# A wall across the way, that ends at y = 1.5, and clutter.
+WORLD = make_world(
+    boxes=[[2.5, -1.0, 0.0, 0.2, 2.5, 0.0, 2.0], [0.5, 1.6, 0.4, 0.3, 0.2, 0.0, 2.0]],
+    cylinders=[[4.0, 0.2, 0.3, 0.0, 2.0]],
+)
+
+init = jax.jit(navigator.init.__wrapped__, static_argnames="spec")
+step = jax.jit(chex.assert_max_traces(navigator.step.__wrapped__, n=2), static_argnames=("spec", "replan"))
+
+
+def f32(values):
+    return jnp.asarray(values, jnp.float32)
+
+
+def look(pose, twist, goal=GOAL, seed=0):
+    """What the sensors say at a pose in `WORLD`."""
+    points, valid = lidar.scan(BEAMS, LidarParams(), WORLD, f32(pose), jax.random.key(seed))
+    return empty_observation(BEAMS.num_points)._replace(
+        points=points, point_valid=valid, pose=f32(pose), twist=f32(twist), goal=f32(goal)
+    )
+
+
+def drive(ticks, pose=(0.0, 0.0, 0.2), goal=GOAL, params=PARAMS, start=None):
+    """Closed loop. Returns a list of (state before, observation, replan, state after, command, info)."""
+    pose, twist = f32(pose), f32([0.0, 0.0])
+    state = init(SPEC, params, pose) if start is None else start
+    record = []
+    for k in range(ticks):
+        seen = look(pose, twist, goal, k)
+        replan = k % SPEC.replan_every == 0
+        after, command, info = step(SPEC, params, state, seen, KEY, replan=replan)
+        record.append((state, seen, replan, after, command, info))
+        pose, twist = kinematic.step(ROBOT, pose, twist, command, SPEC.dt)
+        state = after
+    return record
+
+
+@pytest.fixture(scope="module")
+def trip():
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        return drive(140)
+
+
+def poses(record):
+    return np.array([np.asarray(r[1].pose) for r in record])
+
+
+def within_limits(command, twist):
+    tiny = 1e-5
+    v, w = float(command.v), float(command.omega)
+    return (
+        np.isfinite([v, w]).all()
+        and ROBOT.v_min - tiny <= v <= ROBOT.v_max + tiny
+        and abs(w) <= ROBOT.w_max + tiny
+        and abs(v - twist[0]) <= ROBOT.a_max * SPEC.dt + tiny
+        and abs(w - twist[1]) <= ROBOT.alpha_max * SPEC.dt + tiny
+    )
+
+
+def test_it_drives_around_the_wall_to_the_goal_and_stops(trip):
+    path = poses(trip)
+    assert np.hypot(*(path[-1, :2] - GOAL)) <= PARAMS.goal_tolerance
+    room = [float(clearance(WORLD, f32(p[:2]))) for p in path]
+    assert min(room) > ROBOT.radius
+    assert path[:, 1].max() > 1.7, "around the end of the wall"
+    last = trip[-1]
+    assert bool(last[5].arrived) and float(last[4].v) == float(last[4].omega) == 0.0
+    assert all(within_limits(r[4], np.asarray(r[1].twist)) for r in trip)
+    assert not any(bool(r[5].fault) for r in trip) and int(last[5].recoveries) == 0
+
+
+def test_what_it_says_fits_together(trip):
+    for before, seen, _, after, command, info in trip[5:60:9]:
+        chex.assert_trees_all_equal(after.last_command, jnp.stack(command))
+        np.testing.assert_array_equal(after.last_pose, seen.pose)
+        np.testing.assert_allclose(float(after.time - before.time), SPEC.dt, atol=1e-4)
+        goal = info.local_goal
+        np.testing.assert_array_equal(after.local_goal, goal.xy)
+        assert bool(goal.valid) and bool(info.track.certified)
+        score = pytest.approx(float(goal.score), abs=1e-3)
+        assert float(sum(goal.terms)[0]) == score
+        assert float(goal.geometric + PARAMS.score.risk_weight * goal.exposure) == score
+        true = min(float(clearance(WORLD, seen.pose[:2])), 1.0)
+        assert abs(float(info.clearance) - true) < 0.15  # as the map has it: cells of 5 cm, noise of 2 cm
+
+
+def test_the_plan_is_made_at_replans_only(trip):
+    for before, _, replan, after, _, _ in trip[10:30]:
+        moved = bool(jnp.any(before.belief.corner != after.belief.corner))
+        if replan:
+            assert bool(jnp.any(before.plan != after.plan))
+        elif not moved:
+            chex.assert_trees_all_equal(before.plan, after.plan)
+            chex.assert_trees_all_equal(before.belief.dead_end, after.belief.dead_end)
+
+
+def test_it_is_a_function(trip):
+    state, seen, replan, *after = trip[20]
+    chex.assert_trees_all_equal(step(SPEC, PARAMS, state, seen, KEY, replan=replan), tuple(after))
+    chex.assert_trees_all_equal(step(SPEC, PARAMS, state, seen, jax.random.key(7), replan=replan), tuple(after))
+
+
+def broken(what, seen):
+    nan, rng = jnp.nan, np.random.default_rng(0)
+    points = np.asarray(seen.points).copy()
+    if what == "no scan":
+        return seen._replace(point_valid=jnp.zeros_like(seen.point_valid))
+    if what == "points NaN":
+        return seen._replace(points=seen.points * nan)
+    if what == "some points inf":
+        points[rng.random(len(points)) < 0.3] = np.inf
+        return seen._replace(points=f32(points))
+    if what == "points huge":
+        return seen._replace(points=seen.points * 1e30)
+    if what == "points at the robot":
+        return seen._replace(points=seen.points * 0)
+    if what == "points all around":
+        angle = rng.uniform(-np.pi, np.pi, len(points))
+        return seen._replace(points=f32(np.stack([0.3 * np.cos(angle), 0.3 * np.sin(angle), 0 * angle + 0.5], -1)))
+    if what == "pose NaN":
+        return seen._replace(pose=seen.pose.at[2].set(nan))
+    if what == "pose inf":
+        return seen._replace(pose=seen.pose.at[0].set(jnp.inf))
+    if what == "pose jump":
+        return seen._replace(pose=seen.pose + f32([5.0, -3.0, 1.0]))
+    if what == "pose huge":
+        return seen._replace(pose=f32([1e30, -1e30, 1e9]))
+    if what == "twist NaN":
+        return seen._replace(twist=f32([nan, nan]))
+    if what == "twist inf":
+        return seen._replace(twist=f32([jnp.inf, -jnp.inf]))
+    if what == "twist huge":
+        return seen._replace(twist=f32([1e20, -1e20]))
+    if what == "goal NaN":
+        return seen._replace(goal=f32([nan, 1.0]))
+    if what == "goal inf":
+        return seen._replace(goal=f32([jnp.inf, 0.0]))
+    if what == "goal huge":
+        return seen._replace(goal=f32([1e30, -1e30]))
+    assert what == "all"
+    return jax.tree.map(lambda a: a * nan if a.dtype == jnp.float32 else a, seen)
+
+
+FAULTS = (
+    "no scan", "points NaN", "some points inf", "points huge", "points at the robot", "points all around", "pose NaN",
+    "pose inf", "pose jump", "pose huge", "twist NaN", "twist inf", "twist huge", "goal NaN", "goal inf", "goal huge",
+    "all",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("what", FAULTS)
+def test_broken_sensors_give_no_broken_command(trip, what):
+    """For a second, replans included; then the sensors are back, and the robot goes on."""
+    state, seen, *_ = trip[23]
+    twist = np.asarray(seen.twist)
+    wrong = broken(what, seen)
+    for k in range(7):
+        state, command, info = step(SPEC, PARAMS, state, wrong, KEY, replan=k % 5 == 0)
+        if "twist" not in what and what != "all":
+            wrong = wrong._replace(twist=jnp.stack(command))
+        assert bool(jnp.isfinite(command.v)) and bool(jnp.isfinite(command.omega))
+        assert -0.2 - 1e-6 <= float(command.v) <= 1.0 + 1e-6 and abs(float(command.omega)) <= 1.5 + 1e-6
+        if k == 0 and "twist" not in what:
+            assert what == "all" or within_limits(command, twist)
+        leapt = k == 0 and what in ("pose jump", "pose huge")
+        if what in ("no scan", "points NaN", "pose NaN", "pose inf", "all") or leapt:
+            assert bool(info.fault)
+    if what in ("pose NaN", "pose inf", "all"):
+        assert float(command.v) == float(command.omega) == 0.0, "without a pose it stands still"
+    state, command, info = step(SPEC, PARAMS, state, seen, KEY, replan=True)  # back: to the map this may be a leap
+    for k in range(12):
+        state, command, info = step(SPEC, PARAMS, state, seen, KEY, replan=k % 5 == 0)
+    assert not bool(info.fault) and within_limits(command, twist)
+    finite = jax.tree.map(lambda a: bool(jnp.all(jnp.isfinite(a))), state._replace(points=state.points.xy))
+    assert all(jax.tree.leaves(finite))
+    assert what == "points all around" or float(command.v) > 0.3, "and it drives on"
+
+
+def test_without_a_pose_to_begin_with_it_waits():
+    state = init(SPEC, PARAMS, f32([jnp.nan, 0.0, 0.0]))
+    assert all(bool(jnp.all(jnp.isfinite(a))) for a in jax.tree.leaves(state) if a.dtype == jnp.float32)
+    _, command, info = step(SPEC, PARAMS, state, broken("pose NaN", look([0, 0, 0], [0, 0])), KEY, replan=True)
+    assert float(command.v) == float(command.omega) == 0.0 and bool(info.fault)
+
+
+def test_after_a_leap_the_old_map_is_dropped(trip):
+    state, seen, *_ = trip[50]
+    leapt, _, info = step(SPEC, PARAMS, state, broken("pose jump", seen), KEY, replan=False)
+    assert bool(info.fault)
+    fresh = init(SPEC, PARAMS, seen.pose + f32([5.0, -3.0, 1.0]))
+    want, _, _ = step(SPEC, PARAMS, fresh, broken("pose jump", seen), KEY, replan=False)
+    chex.assert_trees_all_equal(leapt.belief, want.belief)
+
+
+def test_at_the_goal_it_brakes(trip):
+    state, seen, *_ = trip[25]
+    there = seen._replace(goal=seen.pose[:2] + 0.3, twist=f32([0.9, -0.4]))
+    _, command, info = step(SPEC, PARAMS, state, there, KEY, replan=False)
+    assert bool(info.arrived)
+    np.testing.assert_allclose([command.v, command.omega], [0.65, -0.08], atol=1e-6)
+
+
+def test_recovery_never_writes_into_the_belief(trip):
+    """Whatever recovery does or remembers, P_dead and the risk made of it are the same."""
+    state, seen, *_ = trip[30]
+    plain = step(SPEC, PARAMS, state, seen, KEY, replan=True)[0]
+    for mode in (behaviour.CLEAR, behaviour.RETREAT, behaviour.STOP):
+        stuck = state.recovery._replace(
+            mode=jnp.int32(mode), visits=jnp.ones(GRID.shape), attempts=jnp.int32(3), anchor_time=state.time - 100.0,
+        )  # fmt: skip
+        after, _, _ = step(SPEC, PARAMS, state._replace(recovery=stuck), seen, KEY, replan=True)
+        chex.assert_trees_all_equal(after.belief, plain.belief)
+        chex.assert_trees_all_equal(after.risk, plain.risk)
+    assert float(plain.belief.dead_end.std()) > 0
+
+
+def test_a_robot_that_cannot_move_tries_to_recover():
+    """Walled in by an invisible hand: it is told that it stands still whatever it commands."""
+    pose = [0.0, 0.0, 0.2]
+    state, modes = init(SPEC, PARAMS, f32(pose)), []
+    seen = look(pose, [0.0, 0.0])
+    for k in range(160):
+        state, command, info = step(SPEC, PARAMS, state, seen, KEY, replan=k % 5 == 0)
+        modes.append(int(info.mode))
+        assert within_limits(command, (0.0, 0.0))
+    assert behaviour.CLEAR in modes and int(info.recoveries) >= 2
+    assert modes.index(behaviour.CLEAR) == pytest.approx(PARAMS.recovery.stuck_time / SPEC.dt, abs=3)
+    assert float(state.recovery.visits.max()) > 0.9
+
+
+def test_one_trace_for_a_sweep(trip):
+    """Over risk weight, decay, horizon and key: `step` above allows one trace with and one without replanning."""
+    state, seen, *_ = trip[15]
+    scores = set()
+    for k in range(4):
+        score = PARAMS.score._replace(risk_weight=1.0 * k, decay=0.1 * k, horizon=4.0 - k)
+        for replan in (True, False):
+            _, _, info = step(SPEC, PARAMS._replace(score=score), state, seen, jax.random.key(k), replan=replan)
+            scores.add(float(info.local_goal.score))
+    assert len(scores) == 4  # whether it replans before it acts shows only later
+
+
+def compare_batch(record, replan):
+    """One vmapped call over recorded states against single calls."""
+    states, seen = (jax.tree.map(lambda *a: jnp.stack(a), *[r[k] for r in record]) for k in (0, 1))
+    keys = jax.random.split(KEY, len(record))
+    batched = jax.jit(jax.vmap(lambda s, o, k: navigator.step(SPEC, PARAMS, s, o, k, replan=replan)))
+    many = batched(states, seen, keys)
+    one = [step(SPEC, PARAMS, r[0], r[1], KEY, replan=replan) for r in record]
+    one = jax.tree.map(lambda *a: jnp.stack(a), *one)
+    chex.assert_trees_all_close(many[1], one[1], atol=SAME)  # commands
+    for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(one), strict=True):
+        if a.dtype in (jnp.bool_, jnp.int32):
+            assert float(jnp.mean((a == b).astype(jnp.float32))) > 0.999
+        else:
+            np.testing.assert_allclose(a, b, atol=SAME, rtol=SAME)
+
+
+@pytest.mark.parametrize("replan", [True, False])
+def test_a_batch_equals_single_calls(trip, replan):
+    compare_batch(trip[::8][:16], replan)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("replan", [True, False])
+def test_a_batch_of_128_equals_single_calls(trip, replan):
+    compare_batch(trip[:128], replan)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_every_planner_fits_together(planner):
+    spec = dataclasses.replace(SPEC, planner=PLANNERS[planner])
+    state = jax.eval_shape(lambda: navigator.init(spec, PARAMS, f32([0, 0, 0])))
+    seen = empty_observation(0)  # an empty cloud
+    for replan in (True, False):
+        after, command, info = jax.eval_shape(
+            lambda s, replan=replan: navigator.step(spec, PARAMS, s, seen, KEY, replan=replan), state
+        )
+        chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
+        assert command.v.shape == command.omega.shape == () == info.mode.shape
+    assert spec.generator.num_candidates == (34 if not spec.planner.controls else 55)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"dt": 0.0}, "dt must be > 0 s"), ({"replan_every": 0}, "replan_every >= 1")],
+)
+def test_the_spec_is_checked(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(SPEC, **wrong)
