@@ -11,7 +11,9 @@ They know cells only; `geometry` knows where cells lie. Distances are in metres 
 - `descend`: the path that follows V downhill.
 """
 
-from functools import partial, reduce
+import functools
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +28,43 @@ _DIAGONAL = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 _KNIGHT = ((1, 2), (1, -2), (-1, 2), (-1, -2), (2, 1), (2, -1), (-2, 1), (-2, -1))
 
 
+def once(values: Any) -> Any:
+    """The values themselves, computed before they are used, and only once.
+
+    On CPU, XLA fuses whatever it can into each of its uses, and computes it there anew for every element that is read:
+    a stencil over a mask evaluates what makes the mask once per neighbour. A loop is what it does not look through (of
+    `optimization_barrier` nothing is left when it fuses).
+
+    Args:
+        values: Arrays; a pytree.
+    """
+    return jax.lax.fori_loop(0, 2, lambda _, pair: pair[::-1], (values, values))[0]
+
+
+def lesser(a: Array, b: Scalar) -> Array:
+    """The lesser of two numbers: one instruction on CPU, where `jnp.minimum`, which must hand on NaN, takes five."""
+    return jnp.where(a < b, a, b)
+
+
+def greater(a: Array, b: Scalar) -> Array:
+    """The greater of two numbers; see `lesser`."""
+    return jnp.where(a > b, a, b)
+
+
+def pool(values: Array, by: int, reduce: str) -> Array:
+    """Coarser cells: "max", "sum", "mean", "any", "all" over blocks of `by` x `by`."""
+    two = {"max": jnp.maximum, "any": jnp.logical_or, "all": jnp.logical_and}.get(reduce, jnp.add)
+    # rows, then columns, as whole slices: several times as fast as reducing axes of `[h, by, w, by]`
+    rows = functools.reduce(two, [values[k::by] for k in range(by)])
+    blocks = functools.reduce(two, [rows[:, k::by] for k in range(by)])
+    return blocks * (1.0 / by**2) if reduce == "mean" else blocks
+
+
+def repeat(values: Array, by: int) -> Array:
+    """Finer cells: each cell's value on `by` x `by`."""
+    return jnp.repeat(jnp.repeat(values, by, axis=0), by, axis=1)
+
+
 @partial(jax.jit, static_argnames=("max_distance", "resolution"))
 def distance_transform(mask: Bool[Array, "H W"], resolution: float, max_distance: float) -> Float[Array, "H W"]:
     """Distance [m] from each cell's centre to the centre of the nearest True cell, at most `max_distance`.
@@ -37,22 +76,19 @@ def distance_transform(mask: Bool[Array, "H W"], resolution: float, max_distance
     """
     h, w = mask.shape
     n = int(max_distance / resolution + 1e-6)
-
-    def double(k: Array, along: Array) -> Array:
-        reach = jnp.int32(1) << k  # distances below `reach` are right, then those below 2 * reach
-        padded = jnp.pad(along, ((0, 0), (n, n)), constant_values=n + 1)
-        left, right = (jax.lax.dynamic_slice(padded, (0, n + by), (h, w)) for by in (-reach, reach))
-        return jnp.minimum(along, jnp.minimum(left, right) + reach)
-
-    # In whole cells: XLA vectorises the least of integers far better than that of floats. In a loop: unrolled, XLA
-    # would fuse the stages, and whatever makes the mask, into one and compute them over and over.
-    along = jax.lax.fori_loop(0, n.bit_length(), double, jnp.where(mask, jnp.int32(0), jnp.int32(n + 1)))
-    squares = along * along
-    padded = jnp.pad(squares, ((n, n), (0, 0)), constant_values=(n + 1) ** 2)
+    far = (n + 1) ** 2
+    # in whole cells: XLA vectorises the least of integers far better than that of floats
+    kind = jnp.int16 if 2 * far < 2**15 else jnp.int32
+    padded = once(jnp.pad(jnp.where(mask, kind(0), kind(far)), n, constant_values=far))
+    rows = padded[:, n : n + w]
     for k in range(1, n + 1):
-        squares = jnp.minimum(squares, jnp.minimum(padded[n - k : n - k + h], padded[n + k : n + k + h]) + k * k)
-    far = (max_distance / resolution) ** 2
-    return jnp.sqrt(jnp.minimum(squares.astype(jnp.float32), far)) * resolution
+        rows = jnp.minimum(rows, jnp.minimum(padded[:, n - k : n - k + w], padded[:, n + k : n + k + w]) + k * k)
+    padded = once(rows)
+    out = padded[n : n + h]
+    for k in range(1, n + 1):
+        out = jnp.minimum(out, jnp.minimum(padded[n - k : n - k + h], padded[n + k : n + k + h]) + k * k)
+    limit = (max_distance / resolution) ** 2
+    return once(jnp.sqrt(jnp.minimum(out.astype(jnp.float32), limit)) * resolution)
 
 
 def _pack(mask: Bool[Array, "H W"]) -> Array:
@@ -93,7 +129,7 @@ def flood_fill(passable: Bool[Array, "H W"], seeds: Bool[Array, "H W"]) -> Bool[
         return after, jnp.any(after != before)
 
     filled, _ = jax.lax.while_loop(lambda c: c[1], sweep, (_pack(seeds) & may, jnp.asarray(True)))
-    return _unpack(filled, passable.shape[1])
+    return once(_unpack(filled, passable.shape[1]))
 
 
 def _everywhere(mask: Bool[Array, "H W"], rows: tuple[int, int], cols: tuple[int, int]) -> Bool[Array, "H W"]:
@@ -103,8 +139,8 @@ def _everywhere(mask: Bool[Array, "H W"], rows: tuple[int, int], cols: tuple[int
     """
     h, w = mask.shape
     padded = jnp.pad(mask, (rows, cols), constant_values=True)
-    along = reduce(jnp.logical_and, [padded[:, k : k + w] for k in range(sum(cols) + 1)])
-    return reduce(jnp.logical_and, [along[k : k + h] for k in range(sum(rows) + 1)])
+    along = functools.reduce(jnp.logical_and, [padded[:, k : k + w] for k in range(sum(cols) + 1)])
+    return functools.reduce(jnp.logical_and, [along[k : k + h] for k in range(sum(rows) + 1)])
 
 
 def _step_costs(
@@ -130,11 +166,6 @@ def _step_costs(
     return [gate(a, 1.0) for a in (east, west, north, south)] + [diagonal] * 4 + [knight] * 8
 
 
-def _less(a: Array, b: Array) -> Array:
-    """The lesser of numbers: one instruction, where `jnp.minimum`, which must hand on NaN, takes five."""
-    return jnp.where(a < b, a, b)
-
-
 def _both_ways(first: Array, second: Array) -> Array:
     """`[H, 2, W]`: rows from the first to the last, and rows from the last to the first."""
     return jnp.stack([first, second[::-1]], axis=1)
@@ -153,13 +184,13 @@ def _sweep(value: Float[Array, "H W"], costs: list[Array]) -> Float[Array, "H W"
     def settle(i: Array, rows: Array) -> Array:
         two, one, here = jax.lax.dynamic_slice(rows, (i, 0, 0), (3, 2, w + 4))
         straight, diagonal, knight = (jax.lax.dynamic_index_in_dim(cost, i, keepdims=False) for cost in costs)
-        best = _less(here[:, 2:-2], one[:, 2:-2] + straight)
-        best = _less(best, _less(one[:, 1:-3], one[:, 3:-1]) + diagonal)
-        jump = _less(_less(one[:, :-4], one[:, 4:]), _less(two[:, 1:-3], two[:, 3:-1]))
-        return jax.lax.dynamic_update_slice(rows, _less(best, jump + knight)[None], (i + 2, 0, 2))
+        best = lesser(here[:, 2:-2], one[:, 2:-2] + straight)
+        best = lesser(best, lesser(one[:, 1:-3], one[:, 3:-1]) + diagonal)
+        jump = lesser(lesser(one[:, :-4], one[:, 4:]), lesser(two[:, 1:-3], two[:, 3:-1]))
+        return jax.lax.dynamic_update_slice(rows, lesser(best, jump + knight)[None], (i + 2, 0, 2))
 
     rows = jax.lax.fori_loop(0, h, settle, rows)[2:, :, 2:-2]
-    return _less(rows[:, 0], rows[::-1, 1])
+    return lesser(rows[:, 0], rows[::-1, 1])
 
 
 @partial(jax.jit, static_argnames=("max_iterations",))
@@ -185,8 +216,9 @@ def cost_to_go(
         north: Whether one can pass between (i, j) and (i + 1, j); None = likewise.
         max_iterations: Bound on the rounds; the iteration stops by itself when nothing changes.
     """
+    cell_cost, value, east, north = once((cell_cost, jnp.minimum(initial, UNREACHABLE), east, north))
     costs = _step_costs(cell_cost, resolution, east, north)
-    (to_east, to_west, to_north, to_south), diagonal, knight = costs[:4], costs[4], costs[8]
+    to_east, to_west, to_north, to_south, diagonal, knight = once([*costs[:4], costs[4], costs[8]])
     by_row = [_both_ways(a, b) for a, b in ((to_south, to_north), (diagonal, diagonal), (knight, knight))]
     by_col = [_both_ways(a.T, b.T) for a, b in ((to_west, to_east), (diagonal, diagonal), (knight, knight))]
 
@@ -198,7 +230,7 @@ def cost_to_go(
     def unfinished(carry: tuple[Array, Array, Array]) -> Array:
         return carry[1] & (carry[2] < max_iterations)
 
-    begin = (jnp.minimum(initial, UNREACHABLE), jnp.asarray(True), jnp.asarray(0, jnp.int32))
+    begin = (value, jnp.asarray(True), jnp.asarray(0, jnp.int32))
     return jnp.minimum(jax.lax.while_loop(unfinished, sweep, begin)[0], UNREACHABLE)
 
 

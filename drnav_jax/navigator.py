@@ -210,7 +210,7 @@ def rollout_field(spec: NavSpec, params: NavParams, state: NavState) -> tuple[Gr
     origin = geometry.window_origin(state.belief.corner, spec.filter.grid)
     corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
     clear = _fine_clearance(spec, params, state.belief)
-    plan = costmap.repeat(state.plan[top : top + n, left : left + n], 2)
+    plan = grids.repeat(state.plan[top : top + n, left : left + n], 2)
     words = costmap.pack_clearance(plan, clear)
     return GridMap(clear, corner, resolution / 2), GridMap(words, corner, resolution / 2)
 
@@ -228,7 +228,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
     clear = costmap.clearance(local.seen & (local.occupancy > 0), grid.resolution)
     top, left = belief.local_corner(spec.filter)
-    near = costmap.pool(_fine_clearance(spec, params, state.belief), 2, "max")  # what rollouts will find there
+    near = grids.pool(_fine_clearance(spec, params, state.belief), 2, "max")  # what rollouts will find there
     clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
     remembered = state.memory

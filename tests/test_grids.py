@@ -40,6 +40,20 @@ def at_goal(shape, *cells):
     return initial
 
 
+@pytest.mark.parametrize("by", [1, 2, 3])
+def test_pooling_and_repeating(by):
+    values = np.random.default_rng(0).random((6, 12)).astype(np.float32)
+    for how in ("max", "sum", "mean", "any", "all"):
+        boolean = how in ("any", "all")
+        layer = values > 0.6 if boolean else values
+        got = grids.pool(jnp.asarray(layer), by, how)
+        assert got.dtype == layer.dtype
+        for i, j in np.ndindex(6 // by, 12 // by):
+            block = layer[by * i : by * (i + 1), by * j : by * (j + 1)]
+            assert float(got[i, j]) == pytest.approx(float(getattr(block, how)()), rel=1e-6)
+    chex.assert_trees_all_equal(grids.pool(grids.repeat(f32(values), by), by, "max"), f32(values))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.004, 0.1, 1.0])
 def test_distance_transform_equals_scipy(share):
     rng = np.random.default_rng(0)

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drnav_jax import geometry
+from drnav_jax import geometry, grids
 from drnav_jax.types import Scalar
 
 # Added to the ranges of rays without an in-band return, so that one scatter-min finds both the
@@ -244,12 +244,8 @@ def refine(surface: Float[Array, "h w"], returns: Float[Array, "h w"], rate: flo
         returns: Of this scan, on the same cells.
         rate: Weight of one scan.
     """
-    h, w = returns.shape
-    blocks = returns.reshape(h // 2, 2, w // 2, 2)
-    total = jnp.sum(blocks, axis=(1, 3), keepdims=True)
-    share = (blocks / jnp.maximum(total, 1.0)).reshape(h, w)
-    seen = jnp.broadcast_to(total > 0, blocks.shape).reshape(h, w)
-    return surface + jnp.where(seen, rate, 0.0) * (share - surface)
+    total = grids.repeat(grids.once(grids.pool(returns, 2, "sum")), 2)
+    return surface + jnp.where(total > 0, rate * (returns / jnp.maximum(total, 1.0) - surface), 0.0)
 
 
 def fine_obstacles(
@@ -262,8 +258,7 @@ def fine_obstacles(
         occupied: Map cells held to be occupied.
         surface: `refine` on the same area, half the edge.
     """
-    h, w = occupied.shape
-    quarters = (surface >= params.min_share * 0.5).reshape(h, 2, w, 2)
+    quarters = surface >= params.min_share * 0.5
     # a cell that became occupied before it came this near is solid until its quarters are known
-    known = jnp.any(quarters, axis=(1, 3), keepdims=True)
-    return (occupied[:, None, :, None] & (quarters | ~known)).reshape(2 * h, 2 * w)
+    solid = occupied & ~grids.pool(quarters, 2, "any")
+    return (quarters & grids.repeat(occupied, 2)) | grids.repeat(solid, 2)

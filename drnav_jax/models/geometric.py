@@ -57,9 +57,8 @@ def predict(params: GeometricParams, observation: Observation, local_map: LocalM
     by = _POOLING
     h, w = local_map.occupancy.shape
     size = local_map.resolution * by
-    block = lambda a, f: f(a.reshape(h // by, by, w // by, by), axis=(1, 3))  # noqa: E731
-    occupied = block(local_map.seen & (local_map.occupancy > 0), jnp.any)
-    seen = block(local_map.seen, jnp.all)
+    occupied = grids.once(grids.pool(local_map.seen & (local_map.occupancy > 0), by, "any"))
+    seen = grids.once(grids.pool(local_map.seen, by, "all"))
     shape = occupied.shape
     # in cells, so that the resolution may be traced
     reach = 5.0
@@ -82,5 +81,5 @@ def predict(params: GeometricParams, observation: Observation, local_map: LocalM
     well_seen = jnp.clip(_box_mean(seen.astype(jnp.float32), 3) / params.seen_share, 0.0, 1.0)
     confidence = jnp.where(verdict, jnp.where(closed, 1.0, params.open_confidence) * well_seen, 0.0)
     p_dead = jnp.where(closed, params.p_dead, params.p_open).astype(jnp.float32)
-    spread = lambda a: jnp.repeat(jnp.repeat(a, by, axis=0), by, axis=1)  # noqa: E731
-    return Evidence(p_dead=spread(p_dead), confidence=spread(confidence))
+    p_dead, confidence = grids.once((p_dead, confidence))
+    return Evidence(p_dead=grids.once(grids.repeat(p_dead, by)), confidence=grids.once(grids.repeat(confidence, by)))

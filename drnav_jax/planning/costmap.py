@@ -11,6 +11,7 @@ Rollouts spend their time in table look-ups, so clearance, risk and value-to-go 
     bits 16-31 value-to-go above the window's least, 1 cm steps, saturated at 655.35 m
 """
 
+import functools
 from functools import partial
 from typing import NamedTuple
 
@@ -55,17 +56,6 @@ def clearance(occupied: Bool[Array, "H W"], resolution: float) -> Float[Array, "
     return grids.distance_transform(occupied, resolution, MAX_CLEARANCE)
 
 
-def pool(values: Array, by: int, reduce: str) -> Array:
-    """Coarser cells: "max", "mean", "any", "all" over blocks of `by` x `by`."""
-    h, w = values.shape
-    return getattr(jnp, reduce)(values.reshape(h // by, by, w // by, by), axis=(1, 3))
-
-
-def repeat(values: Array, by: int) -> Array:
-    """Finer cells: each cell's value on `by` x `by`."""
-    return jnp.repeat(jnp.repeat(values, by, axis=0), by, axis=1)
-
-
 def sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
     """Through which east and north sides of the coarse cells one gets from free map cell to free map cell.
 
@@ -74,9 +64,11 @@ def sides(free: Bool[Array, "H W"], by: int) -> tuple[Array, Array]:
     """
     h, w = free.shape
     ahead = jnp.pad(free, ((0, 1), (0, 1)))
-    across = (free & ahead[:h, 1:])[:, by - 1 :: by].reshape(h // by, by, w // by)
-    along = (free & ahead[1:, :w])[by - 1 :: by].reshape(h // by, w // by, by)
-    return jnp.any(across, axis=1), jnp.any(along, axis=2)
+    across, along = (free & ahead[:h, 1:])[:, by - 1 :: by], (free & ahead[1:, :w])[by - 1 :: by]
+    return (
+        functools.reduce(jnp.logical_or, [across[k::by] for k in range(by)]),
+        functools.reduce(jnp.logical_or, [along[:, k::by] for k in range(by)]),
+    )
 
 
 @jax.jit

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from drnav_jax.grids import greater, lesser
 from drnav_jax.types import Command, RobotParams, Scalar
 
 
@@ -29,7 +30,7 @@ class Motion(NamedTuple):
 
 def approach(value: Array, target: Array, step: Scalar) -> Array:
     """`target`, as far as `value` may change by `step` (>= 0) in one tick."""
-    return jnp.clip(target, value - step, value + step)
+    return lesser(greater(target, value - step), value + step)
 
 
 def rotate(c: Array, s: Array, angle: Array) -> tuple[Array, Array]:

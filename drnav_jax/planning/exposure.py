@@ -5,8 +5,9 @@ Along a path with arc length s and discount w(s) = exp(-decay s):
     EDE(path) = sum_k w_k P_dead^foot(c_k)                              (discrete)
     EDE(path) = integral_0^L w(s) P_dead^foot(x(s)) ds                  (continuous)
 
-The sum depends on the step of the path, the integral does not. Both are differentiable in the path and in the map. A robot that stands or turns on the spot moves along no arc and would be exposed to nothing; the
-integral charges it P^foot times an equivalent length per second instead.
+The sum depends on the step of the path, the integral does not; planners use the integral (`scoring` as a sum over the
+steps of a rollout). Both are differentiable in the path and in the map. A robot that stands or turns on the spot moves
+along no arc and would be exposed to nothing; the integral charges it P^foot times an equivalent length per second.
 """
 
 from functools import partial

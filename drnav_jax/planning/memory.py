@@ -105,7 +105,7 @@ def update(
     rim_north = (jnp.arange(h // by) == h // by - 1)[:, None]
     old = jax.lax.dynamic_slice(state.east, corner, east.shape), jax.lax.dynamic_slice(state.north, corner, north.shape)
     kept = MemoryState(
-        free=put(state.free, costmap.pool(free, by, "any")),
+        free=put(state.free, grids.pool(free, by, "any")),
         east=put(state.east, jnp.where(rim_east, old[0], east)),
         north=put(state.north, jnp.where(rim_north, old[1], north)),
         value=state.value,
@@ -137,4 +137,4 @@ def beyond(spec: MemorySpec, state: MemoryState, shape: tuple[int, int], pooling
     by = spec.pooling
     corner = ((spec.cells - h // by) // 2, (spec.cells - w // by) // 2)
     part = jax.lax.dynamic_slice(state.value, corner, (h // by, w // by))
-    return costmap.repeat(part, by // pooling)
+    return grids.repeat(part, by // pooling)

@@ -63,7 +63,7 @@ class Route(NamedTuple):
 
 def _spread(value: Array, by: int) -> Array:
     """Coarse values on the fine cells: bilinear where all neighbours are reachable, else the cell's own."""
-    own = costmap.repeat(value, by)
+    own = grids.repeat(value, by)
     h, w = value.shape
     padded = jnp.pad(value, 1, mode="edge")
     out = jnp.zeros_like(own).reshape(h, by, w, by)
@@ -122,7 +122,7 @@ def solve(
     leave = near & (here < closed) & (clear >= here - resolution)
     free = (clear >= closed) | leave | (at_goal & (clear > 0.5 * robot.radius))
     east, north = costmap.sides(free, by)
-    clear, risk, visits = (costmap.pool(a, by, "mean") for a in (clear, risk, visits))
+    clear, risk, visits = (grids.pool(a, by, "mean") for a in (clear, risk, visits))
     h, w = clear.shape
     x, y = geometry.cell_centres((h, w), origin, size)
     to_goal, to_robot = jnp.hypot(x - goal[0], y - goal[1]), jnp.hypot(x - xy[0], y - xy[1])
@@ -134,7 +134,7 @@ def solve(
         + jnp.minimum(params.risk_weight * risk, params.risk_cap)
         + params.visit_weight * visits
     )
-    cost = jnp.where(costmap.pool(free, by, "any"), cost, grids.UNREACHABLE)
+    cost = jnp.where(grids.pool(free, by, "any"), cost, grids.UNREACHABLE)
     row, col = jnp.arange(h)[:, None], jnp.arange(w)[None, :]
     edge = (row == 0) | (row == h - 1) | (col == 0) | (col == w - 1)
     held = geometry.inside(geometry.cell_of(goal, origin, size), (h, w))

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from drnav_jax.grids import greater, lesser
 from drnav_jax.planning import costmap
 from drnav_jax.planning.dynamics import Motion, approach, rotate
 from drnav_jax.planning.exposure import STANDING_SPEED
@@ -95,8 +96,8 @@ def look_up(field: GridMap, x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Clearance [m], risk and value [m] of the cells under (x, y), out of packed words; beyond the edge the edge's."""
     h, w = field.values.shape
     inv = 1.0 / field.resolution
-    col = jnp.clip((x - field.origin[0]) * inv, 0.0, w - 1.0).astype(jnp.int32)
-    row = jnp.clip((y - field.origin[1]) * inv, 0.0, h - 1.0).astype(jnp.int32)
+    col = lesser(greater((x - field.origin[0]) * inv, 0.0), w - 1.0).astype(jnp.int32)
+    row = lesser(greater((y - field.origin[1]) * inv, 0.0), h - 1.0).astype(jnp.int32)
     return costmap.unpack(field.values.reshape(-1).at[row * w + col].get(mode="promise_in_bounds"))
 
 
@@ -122,15 +123,15 @@ def _score_block(
         alive = going & (near >= block)
         hit = hit | (going & (near < block))
         arc = arc + ds
-        lack = jnp.maximum((soft - near) * slope, 0.0)
+        lack = greater((soft - near) * slope, 0.0)
         cost = cost + lack * lack * ds
-        risk_sum = risk_sum + jnp.exp(-params.decay * arc) * risk * jnp.maximum(ds, STANDING_SPEED * dt)
+        risk_sum = risk_sum + jnp.exp(-params.decay * arc) * risk * greater(ds, STANDING_SPEED * dt)
         turned = turned + jnp.abs(w) * dt
         geometric = (
             params.progress * (value + arc)
             + params.clearance * cost
             + params.smoothness * turned
-            + params.range_bias * jnp.maximum(params.range_min - arc, 0.0)
+            + params.range_bias * greater(params.range_min - arc, 0.0)
         )
         score = geometric + params.risk_weight * risk_sum
         better = alive & (score < best[0]) & (arc >= params.range_least)

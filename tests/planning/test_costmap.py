@@ -65,18 +65,6 @@ def test_packing_is_exact_at_its_ends():
     np.testing.assert_allclose(value, [[0.0, 655.35]], rtol=1e-6)
 
 
-def test_pooling_and_repeating():
-    values = np.random.default_rng(0).random((6, 8)).astype(np.float32)
-    for how in ("max", "mean"):
-        got = costmap.pool(f32(values), 2, how)
-        for i, j in np.ndindex(3, 4):
-            block = values[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
-            assert abs(float(got[i, j]) - getattr(block, how)()) < ROUNDING
-    bits = jnp.asarray(values > 0.6)
-    assert bool((costmap.pool(bits, 2, "all") <= costmap.pool(bits, 2, "any")).all())
-    chex.assert_trees_all_equal(costmap.pool(costmap.repeat(f32(values), 3), 3, "max"), f32(values))
-
-
 def test_every_verb_is_traced_once():
     verbs = [costmap.clearance, costmap.pack_plan, costmap.pack_clearance]
     clearance, plan, word = (

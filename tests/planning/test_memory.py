@@ -31,7 +31,7 @@ def write(state, free, origin=ORIGIN, goal=(0.2, 0.2), spec=SPEC):
 
 def test_it_equals_dijkstra_on_what_it_holds():
     rng = np.random.default_rng(0)
-    free = rng.random(GRID.shape) < 0.6
+    free = np.kron(rng.random((8, 12)) < 0.8, np.ones((4, 4), bool)) & (rng.random(GRID.shape) < 0.6)
     goal = np.array([0.3, -0.5])
     held = write(memory.init(SPEC), free, goal=goal)
     cost, east, north = np.ones((24, 24)), np.ones((24, 24), bool), np.ones((24, 24), bool)
@@ -50,6 +50,7 @@ def test_it_equals_dijkstra_on_what_it_holds():
             north[i, j] = any(free[4 * a + 3, c] and free[4 * a + 4, c] for c in range(4 * b, 4 * b + 4))
     initial = np.where((away < SIZE) & (cost < 1e4), away, 1e4)
     want = reference.dijkstra(cost, initial, SIZE, east, north)
+    assert 5 < (cost == 1e4).sum() and (want == 1e4).sum() < 50
     np.testing.assert_allclose(held.value, want, rtol=1e-5)
     rim = memory.beyond(SPEC, held, GRID.shape, 2)
     assert rim.shape == (16, 24)
@@ -81,10 +82,14 @@ def test_what_rolls_out_of_the_window_is_remembered():
 
 
 def test_moving_there_and_back_loses_only_what_left_the_memory():
-    held = write(memory.init(SPEC), np.random.default_rng(1).random(GRID.shape) < 0.4)
+    held = write(memory.init(SPEC), np.random.default_rng(1).random(GRID.shape) < 0.1)
     by = jnp.asarray([8, -16], jnp.int32)
-    back = memory.shift(SPEC, memory.shift(SPEC, held, by), -by)
+    moved = memory.shift(SPEC, held, by)
+    back = memory.shift(SPEC, moved, -by)
     for name in ("free", "east", "north"):
+        there = np.asarray(getattr(moved, name))
+        np.testing.assert_array_equal(there[:-2, 4:], np.asarray(getattr(held, name))[2:, :-4])
+        assert not there.all()
         a, b = np.asarray(getattr(held, name)), np.asarray(getattr(back, name))
         np.testing.assert_array_equal(a[2:, :-4], b[2:, :-4])
         assert b[:2].all() and b[:, -4:].all(), "unknown counts as free"

@@ -10,7 +10,7 @@ from scipy import ndimage
 import reference
 from drnav_jax.planning import costmap, scoring
 from drnav_jax.planning.dynamics import Motion
-from drnav_jax.planning.exposure import STANDING_SPEED
+from drnav_jax.planning.exposure import STANDING_SPEED, exposure_integral
 from drnav_jax.planning.scoring import BLOCKED, Candidates, ScoreParams
 from drnav_jax.types import GridMap, RobotParams
 
@@ -166,6 +166,22 @@ def test_without_risk_weight_the_score_is_geometry_bit_for_bit():
     np.testing.assert_allclose(  # eq. 8
         np.asarray(heavy.score)[free], np.asarray(heavy.geometric + 5.0 * heavy.exposure)[free], rtol=1e-5
     )
+
+
+def test_exposure_is_the_integral_along_the_path():
+    """The kernel adds up whole steps over whole cells: on a smooth field that is the integral, nearly."""
+    smooth = ndimage.gaussian_filter((np.random.default_rng(3).random(SHAPE) < 0.3).astype(float), 6)
+    field = pack(np.ones(SHAPE), smooth, np.ones(SHAPE))
+    far = PARAMS._replace(range_max=9.0, range_bias=50.0, range_min=9.0)  # the longest prefix wins
+    candidates = population(11, num=12)
+    candidates = candidates._replace(reach=f32(np.full(12, 9.0)), v=f32(np.linspace(0.4, 1.0, 12)))
+    got = run(field, candidates, far)
+    risk = GridMap(f32(smooth), f32(ORIGIN), RESOLUTION)
+    for k in range(12):
+        path = scoring.path_of(scoring.at(candidates, jnp.int32(k)), ROBOT, dt=DT, num_steps=STEPS)
+        begin = f32([[candidates.motion.x[k], candidates.motion.y[k]]])
+        want = float(exposure_integral(risk, jnp.concatenate([begin, path]), far.decay, dt=DT))
+        assert float(got.exposure[k]) == pytest.approx(want, rel=0.03) and want > 0.1
 
 
 @pytest.mark.parametrize("horizon", [0.5, 2.0, 3.1])

@@ -1,0 +1,59 @@
+"""What the front page shows must work."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from drnav_jax import cli
+from drnav_jax.planning import PLANNERS
+
+ROOT = Path(__file__).resolve().parents[1]
+TEXT = (ROOT / "README.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_the_script_arrives():
+    (script,) = blocks("python")
+    assert len([line for line in script.splitlines() if line.strip()]) <= 15
+    env = os.environ | {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache")}
+    done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("arrived: True, after ")
+
+
+def test_the_commands_are_commands():
+    lines = [line.split("#")[0].split() for block in blocks("bash") for line in block.splitlines()]
+    ours = [words[1:] for words in lines if words and words[0] == "drnav"]
+    assert len(ours) == 2
+    for argv in ours:
+        args = cli.parse(argv)
+        assert isinstance(args, cli.Run | cli.Compare)
+        assert cli.setups_of(args) and cli.scenes_of(args)
+    targets = {words[1] for words in lines if words and words[0] == "make"}
+    assert targets == {"demo", "test"}
+
+
+def test_what_it_points_to_exists():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", TEXT) if not link.startswith("http")]
+    assert len(links) > 10
+    assert [link for link in links if not (ROOT / link).exists()] == []
+
+
+def test_the_picture_is_small():
+    file = ROOT / "docs" / "trajectory.png"
+    assert file.stat().st_size < 300_000
+    with Image.open(file) as picture:
+        assert 1000 <= picture.width <= 1400
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_planner_is_named(name):
+    assert f"`{name}`" in TEXT
