@@ -302,7 +302,8 @@ def _act(
             geometry.sample_nearest(visited, points.xy, fill=0.0), pose[:2],
         )  # fmt: skip
         recover = behaviour.update(
-            grid, params.recovery, recover, time, spec.dt, pose[:2], jnp.abs(twist[0]) * spec.dt, window.origin, choice.valid, state.reachable,
+            grid, params.recovery, recover, time, spec.dt, pose[:2], jnp.abs(twist[0]) * spec.dt, window.origin,
+            choice.valid, state.reachable,
             refuge, has_refuge,
         )  # fmt: skip
     track = tracker.track(

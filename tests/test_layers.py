@@ -39,7 +39,7 @@ RANKS = {
     "geometry": 0,
     "grids": 0,
 }
-SIDEWAYS = {("sim", "worlds"), ("geometry", "types"), ("grids", "types")}
+SIDEWAYS = {("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate")}
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400
 # Heavy or talkative, and needed by one subpackage each, which imports them when it is used.

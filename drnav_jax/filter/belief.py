@@ -39,9 +39,9 @@ class FilterSpec:
         """Check sizes."""
         if self.num_bearings < 8:
             raise ValueError(f"num_bearings must be >= 8 bins, got {self.num_bearings}.")
-        if self.local_cells % 2 or not 16 <= self.local_cells <= min(self.grid.shape):
+        if self.local_cells % 2 or not 8 <= self.local_cells <= min(self.grid.shape):
             raise ValueError(
-                f"local_cells must be even and within 16..{min(self.grid.shape)}, got {self.local_cells}."
+                f"local_cells must be even and within 8..{min(self.grid.shape)}, got {self.local_cells}."
             )
 
 
@@ -156,8 +156,9 @@ def observe(
     )
     top, left = local_corner(spec)
     corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
+    fine = 2 * spec.local_cells
     returns = occupancy.fine_returns(
-        params.occupancy, state.surface.shape, corner, resolution / 2, pose, points, point_valid, spec.num_bearings
+        params.occupancy, (fine, fine), corner, resolution / 2, pose, points, point_valid, spec.num_bearings
     )
     surface = occupancy.refine(state.surface, returns)
     belief, seen = occupancy.apply(

@@ -156,7 +156,7 @@ def candidates(
     edge = 2 * spec.grid.resolution
     known_free = local_map.seen & (local_map.occupancy < 0)
     passable = known_free & reachable & (p_dead < params.p_max)
-    passable = passable.reshape(h // 2, 2, w // 2, 2).all((1, 3))
+    passable = grids.once(grids.pool(passable, 2, "all"))
     rank = openness(passable, spec.num_directions, math.ceil(spec.open_distance / edge - 1e-6))
     clearance = jnp.floor(grids.distance_transform(~passable, edge, _CLEARANCE) / edge + 1e-3)
     score = clearance * (_APART + 1.0) + rank
@@ -193,7 +193,7 @@ def merge(
     """
     now = jnp.asarray(time, jnp.float32)
     reach = jnp.square(params.merge_distance)
-    apart = jnp.sum(jnp.square(points.xy[:, None, :] - xy[None, :, :]), axis=-1)
+    apart = _squared(points.xy, xy)
     again = jnp.any((apart < reach) & valid[None, :], axis=1)
     last_seen = jnp.where(again & points.valid, now, points.last_seen)
 
@@ -205,7 +205,7 @@ def merge(
     order = jnp.lexsort((-last_seen, -rank, ~valid))
     xy, rank, last_seen, valid = xy[order], rank[order], last_seen[order], valid[order]
 
-    apart = jnp.sum(jnp.square(xy[:, None, :] - xy[None, :, :]), axis=-1)
+    apart = _squared(xy, xy)
     near = (apart < reach) & valid[None, :] & valid[:, None]
     better = jnp.tril(near, -1)
     taken = _greedy(better) & valid
@@ -218,6 +218,11 @@ def merge(
         last_seen=jnp.where(kept, sighted[index], 0.0),
         valid=kept,
     )
+
+
+def _squared(a: Float[Array, "M 2"], b: Float[Array, "C 2"]) -> Float[Array, "M C"]:
+    """Squared distances between points (coordinate by coordinate: summing over an axis of two is slow)."""
+    return jnp.square(a[:, :1] - b[None, :, 0]) + jnp.square(a[:, 1:] - b[None, :, 1])
 
 
 def _greedy(better: Bool[Array, "N N"]) -> Bool[Array, " N"]:

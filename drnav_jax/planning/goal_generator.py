@@ -17,7 +17,7 @@ from drnav_jax import geometry
 from drnav_jax.planning import dynamics, scoring
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.planning.scoring import BLOCKED, Candidates, ScoreParams, Terms
-from drnav_jax.types import GridMap, RobotParams
+from drnav_jax.types import GridMap, RobotParams, Scalar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ def candidates(
     twist: Float[Array, "2"],
     goal: Float[Array, "2"],
     last: Float[Array, "2"],
-    hysteresis: Array,
+    hysteresis: Scalar,
 ) -> Candidates:
     """The K candidates: controls first, then headings, then the last g*, then the goal."""
     controls = spec.num_speeds * spec.num_turns

@@ -5,9 +5,9 @@ Optimistic (unknown = free), on cells `pooling` times as coarse as the map's. A 
     1 + w_o ((d_soft - d) / (d_soft - d_block))_+^2 + min(risk_weight * risk, risk_cap) + w_v visits
 
 with the clearance term of J_geom (`scoring`), so that the value falls along a good path at least as fast as the path's own
-cost grows. Thus the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the only way
-may look like a dead end. Edge cells of the window are worth what `memory` says of the world beyond, at least their straight
-distance to the goal.
+cost grows. Thus the predicted dead ends are inside the value and not a force against it; risk stays bounded, because the
+only way may look like a dead end. Edge cells of the window are worth what `memory` says of the world beyond, at least
+their straight distance to the goal.
 """
 
 import dataclasses
@@ -113,14 +113,15 @@ def solve(
             the straight distance to the goal.
     """
     by, size = spec.pooling, resolution * spec.pooling
-    x, y = geometry.cell_centres(clear.shape, origin, resolution)
+    rows, cols = clear.shape
+    x, y = geometry.cell_centres((rows, cols), origin, resolution)
     near = jnp.hypot(x - xy[0], y - xy[1]) < params.escape_radius
     # closed, unless the robot stands there already or the goal is there
     at_goal = jnp.hypot(x - goal[0], y - goal[1]) <= 1.5 * size
     closed = robot.radius + jnp.where(squeeze, params.squeeze_margin, params.closed_margin)
     here = geometry.sample_nearest(GridMap(clear, origin, resolution), xy)
     leave = near & (here < closed) & (clear >= here - resolution)
-    free = (clear >= closed) | leave | (at_goal & (clear > 0.5 * robot.radius))
+    free = grids.once((clear >= closed) | leave | (at_goal & (clear > 0.5 * robot.radius)))
     east, north = costmap.sides(free, by)
     clear, risk, visits = (grids.pool(a, by, "mean") for a in (clear, risk, visits))
     h, w = clear.shape

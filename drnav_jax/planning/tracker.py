@@ -28,7 +28,6 @@ from drnav_jax.planning import dynamics
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.types import Command, GridMap, RobotParams, Scalar
 
-
 DIP = 0.004  # [m]
 
 
@@ -126,11 +125,10 @@ def track(
 
     def drive(m: Motion) -> tuple[Motion, Array]:
         """One tick at the speeds of `m`; least clearance on the way."""
-        least = None
+        least = jnp.full_like(m.x, jnp.inf)
         for _ in range(spec.samples):
             m = dynamics.advance(m, m.v, m.w, robot, dt / spec.samples)
-            here = room(m)
-            least = here if least is None else jnp.minimum(least, here)
+            least = jnp.minimum(least, room(m))
         return m, least
 
     start = dynamics.start(pose, twist, v.shape[0])._replace(v=v, w=w)

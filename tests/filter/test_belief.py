@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from drnav_jax.filter import FilterParams, FilterSpec, FilterState, belief
 from drnav_jax.types import Evidence, GridSpec
 
-SPEC = FilterSpec(grid=GridSpec(shape=(12, 16), resolution=0.1, stride=2))
+SPEC = FilterSpec(grid=GridSpec(shape=(12, 16), resolution=0.1, stride=2), local_cells=8)
 PARAMS = FilterParams()
 L0 = np.float32(np.log(np.float32(0.06)) - np.log1p(np.float32(-0.06)))
 
@@ -23,6 +23,7 @@ def random_state(seed, xy):
     return FilterState(
         occupancy=jnp.asarray(np.where(seen, rng.normal(size=seen.shape), 0), jnp.float32),
         seen=jnp.asarray(seen),
+        surface=jnp.asarray(rng.random(state.surface.shape), jnp.float32),
         dead_end=jnp.asarray(rng.normal(size=seen.shape), jnp.float32),
         corner=state.corner,
     )

@@ -388,3 +388,32 @@ def test_batch_equals_loop_and_traces_once():
     for i, (belief, seen) in enumerate(loop):
         np.testing.assert_array_equal(np.asarray(batch[1][i]), np.asarray(seen))
         np.testing.assert_allclose(np.asarray(batch[0][i]), np.asarray(belief), atol=1e-6)
+
+
+def test_quarters_of_a_cell_follow_the_returns():
+    """Of an occupied cell only the quarters into which returns fall are solid; before any fell, all of them."""
+    returns = np.zeros((4, 6), np.float32)
+    returns[2, 3] = 9.0  # cell (1, 1), its south-east quarter
+    returns[3, 3] = 1.0  # a stray return: a tenth of the cell's
+    surface = np.zeros((4, 6), np.float32)
+    for _ in range(40):
+        surface = np.asarray(occupancy.refine(jnp.asarray(surface), jnp.asarray(returns)))
+    np.testing.assert_allclose(surface[2:4, 2:4], [[0.0, 0.9], [0.0, 0.1]], atol=1e-3)  # 0.8^40 of the start is left
+    occupied = np.zeros((2, 3), bool)
+    occupied[1, 1] = occupied[0, 2] = True
+    fine = np.asarray(occupancy.fine_obstacles(PARAMS._replace(min_share=0.3), jnp.asarray(occupied), jnp.asarray(surface)))
+    expected = np.zeros((4, 6), bool)
+    expected[2, 3] = True
+    expected[0:2, 4:6] = True
+    np.testing.assert_array_equal(fine, expected)
+
+
+def test_a_few_noisy_returns_before_a_wall_are_no_hit():
+    """One return of ten in the cell before a wall's is noise of the range; the same one alone is an obstacle."""
+    wall, stray = [[1.05, 0.05, 0.5]] * 10, [[0.95, 0.05, 0.5]]
+    origin, pose = jnp.asarray([-2.0, -2.0], jnp.float32), jnp.zeros(3, jnp.float32)
+    for points, expected in ((wall + stray, False), (stray, True)):
+        cloud = jnp.asarray(points, jnp.float32)
+        valid = jnp.ones(len(points), bool)
+        hit, _ = occupancy.observed(PARAMS, (40, 40), origin, 0.1, pose, cloud, valid)
+        assert bool(hit[20, 29]) is expected
