@@ -45,9 +45,7 @@ def _interleaved(calls: list[Callable[[], object]], repeats: int) -> list[float]
     return [statistics.median(spent) for spent in times]
 
 
-def random_obstacles(
-    seed: int, num_obstacles: int, extent: float = 20.0, gap: float = 0.5
-) -> World:
+def random_obstacles(seed: int, num_obstacles: int, extent: float = 20.0, gap: float = 0.5) -> World:
     """A world of boxes at all angles and cylinders, half of each, around a free origin.
 
     Args:
@@ -68,16 +66,10 @@ def random_obstacles(
     yaw = rng.uniform(-np.pi, np.pi, (num_obstacles, 1))
     boxes = np.concatenate([centre, yaw, half, z], axis=1)[:num_boxes]
     cylinders = np.concatenate([centre, half[:, :1], z], axis=1)[num_boxes:]
-    return World(
-        boxes=jnp.asarray(boxes, jnp.float32),
-        cylinders=jnp.asarray(cylinders, jnp.float32),
-        field=no_field(),
-    )
+    return World(jnp.asarray(boxes, jnp.float32), jnp.asarray(cylinders, jnp.float32), field=no_field())
 
 
-def native_lidar(
-    spec: LidarSpec, params: LidarParams, world: World, pose: np.ndarray
-) -> Callable[[], np.ndarray]:
+def native_lidar(spec: LidarSpec, params: LidarParams, world: World, pose: np.ndarray) -> Callable[[], np.ndarray]:
     """The rays of `sim.cast` in native MuJoCo (`mj_multiRay`), ready to be cast again and again.
 
     Args:
@@ -118,9 +110,7 @@ def native_lidar(
     met, ranges = np.zeros(spec.num_points, np.int32), np.zeros(spec.num_points)
 
     def cast_native() -> np.ndarray:
-        mujoco.mj_multiRay(
-            model, data, sensor, rays, None, 1, -1, met, ranges, None, spec.num_points, limit
-        )
+        mujoco.mj_multiRay(model, data, sensor, rays, None, 1, -1, met, ranges, None, spec.num_points, limit)
         ranges[met < 0] = np.inf
         return ranges.reshape(spec.rings, spec.azimuths)
 
@@ -128,11 +118,7 @@ def native_lidar(
 
 
 def lidar_against_mujoco(
-    seed: int = 0,
-    num_obstacles: int = 100,
-    rings: int = 16,
-    azimuths: int = 360,
-    repeats: int = 30,
+    seed: int = 0, num_obstacles: int = 100, rings: int = 16, azimuths: int = 360, repeats: int = 30
 ) -> dict[str, float]:
     """Our LiDAR and native `mj_multiRay` on the same rays, world and pose.
 
