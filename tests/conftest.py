@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,3 +54,11 @@ def shared_data() -> Path:
         where = f"DRNAV_DATA={named}" if named else "../shared/data beside the checkout"
         pytest.skip(f"needs real input data: {where} is not there; set DRNAV_DATA to its folder.")
     return folder
+
+
+@pytest.fixture
+def ctrl_c():
+    """Ctrl-C raises KeyboardInterrupt, also where this process was started with SIGINT ignored (a background job)."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

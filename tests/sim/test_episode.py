@@ -215,6 +215,7 @@ def test_a_replay_is_the_episode_again(params, result):
     np.testing.assert_allclose(states[1].pose, result.log.pose[PASSES, 9], atol=1e-5)
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupt_keeps_what_is_finished():
     rows = [ROWS[INSIDE], (EMPTY, (0, 0, 0), (1e6, 0), 1.0, 0.0, 0.0, 1e6)]
     counts = []
