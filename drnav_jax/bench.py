@@ -1,12 +1,15 @@
 """Times of the parts next to their rivals, measured in turn within one run.
 
-What is timed: the robot's whole tick on a recorded drive, the scoring of candidates in the field of that drive, the LiDAR
-against native MuJoCo, and batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from slow code.
+What is timed: the robot's whole tick on a recorded drive, the scoring of candidates in the field of that drive, the
+LiDAR against native MuJoCo, and batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from
+slow code.
 """
 
+import functools
 import importlib
 import os
 import platform
+import re
 import statistics
 import time
 from collections.abc import Callable
@@ -28,9 +31,10 @@ from drnav_jax.types import GridMap, Observation, empty_observation
 from drnav_jax.worlds.world import World, no_field
 
 DRIVE = "t"  # family whose world is driven for the recording: corridors, a fork, a dead end
+STRIDE = 20  # ticks of the drive between two places at which candidates are scored
 FAMILIES = ("u", "t", "l", "corridor", "open")  # of the batched episodes, in turn
 NUM_STEPS = 56  # T of the scoring
-PACE = 0.3  # [m/s] limit of the batched episodes, so that none arrives within its 600 steps
+PACE = 0.2  # [m/s] limit of the batched episodes, so that none arrives within its 600 steps
 
 
 def _interleaved(calls: list[Callable[[], object]], repeats: int) -> list[float]:
@@ -158,13 +162,13 @@ def lidar_against_mujoco(
 
 
 class Drive(NamedTuple):
-    """A recorded drive: what the robot was, what it sensed at each tick, and what it knew after the last."""
+    """A recorded drive: what the robot was, what it sensed at each tick, and what it knew then, now and again."""
 
     spec: NavSpec
     params: NavParams
-    observations: list[Observation]
     begin: NavState
-    end: NavState
+    observations: list[Observation]
+    stops: list[tuple[Observation, NavState]]  # every `STRIDE` ticks
 
 
 def record(num_ticks: int, num_candidates: int = 4096, seed: int = 0) -> Drive:
@@ -185,7 +189,7 @@ def record(num_ticks: int, num_candidates: int = 4096, seed: int = 0) -> Drive:
     goal = jnp.asarray(scene.goal, jnp.float32)
     keys = jax.random.split(jax.random.key(seed), num_ticks)
     state = begin = navigator.init(spec, params, pose)
-    observations = []
+    observations, stops = [], []
     for k in range(num_ticks):
         points, valid = scan(beams, lidar, scene.world, pose, keys[k])
         seen = empty_observation(points.shape[0])._replace(
@@ -193,10 +197,12 @@ def record(num_ticks: int, num_candidates: int = 4096, seed: int = 0) -> Drive:
         )
         observations.append(seen)
         state, command, info = navigator.step(spec, params, state, seen, keys[k], replan=k % spec.replan_every == 0)
+        if k % STRIDE == STRIDE - 1:
+            stops.append((seen, state))
         if info.arrived:
             break
         pose, twist = kinematic.step(params.robot, pose, twist, command, spec.dt)
-    return Drive(spec, params, observations, begin, state)
+    return Drive(spec, params, begin, observations, stops)
 
 
 def tick_times(drive: Drive, warm_up: int = 20) -> dict[str, float]:
@@ -224,14 +230,13 @@ def tick_times(drive: Drive, warm_up: int = 20) -> dict[str, float]:
     }
 
 
-def _candidates(drive: Drive, num: int) -> scoring.Candidates:
-    """`num` candidates of a moving robot where the drive ended."""
+def _candidates(params: NavParams, seen: Observation, state: NavState, num: int) -> scoring.Candidates:
+    """`num` candidates of a moving robot at a stop of a drive."""
     speeds = 16 if num <= 4096 else 64
     spec = GeneratorSpec(num_speeds=speeds, num_turns=(num - 256) // speeds, num_headings=256)
-    seen, params = drive.observations[-1], drive.params
     twist = jnp.asarray([0.6, 0.4], jnp.float32)
     return goal_generator.candidates(
-        spec, params.score, params.robot, seen.pose, twist, seen.goal, drive.end.local_goal, params.hysteresis
+        spec, params.score, params.robot, seen.pose, twist, seen.goal, state.local_goal, params.hysteresis
     )
 
 
@@ -250,49 +255,58 @@ def _bilinear(layers: tuple[GridMap, GridMap, GridMap], x: jax.Array, y: jax.Arr
 def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[str, float], float]:
     """Candidate-steps per second of `scoring.score`, its error, and the time of the reference matmul [ms].
 
-    T = `NUM_STEPS` steps of 0.1 s, risk and obstacle cost, limited in acceleration from a moving state, in the field that
-    the navigator makes. The error is that of nearest packed look-ups against bilinear look-ups in float, over the
-    candidates that are free in both: of the score, relative to the way it counts (score less the least value).
+    T = `NUM_STEPS` steps of 0.1 s, risk and obstacle cost, limited in acceleration from a moving state, in the field
+    that the navigator makes. The error is that of nearest packed look-ups against bilinear look-ups in float, over all
+    stops of the drive.
     """
-    local, field = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, navigator.NavParams(), drive.end)
     params = drive.params.score._replace(horizon=jnp.asarray(0.1 * NUM_STEPS, jnp.float32))
-    robot = drive.params.robot
+    field_of = jax.jit(navigator.rollout_field, static_argnums=0)
+    cell = drive.spec.filter.grid.resolution
 
-    def scores(num: int, **how: Any) -> Callable[[], scoring.Scores]:
-        chosen = _candidates(drive, num)
-        layers = how.pop("layers", field)
-        return lambda: scoring.score(layers, chosen, params, robot, dt=0.1, num_steps=NUM_STEPS, **how)
+    def score(field: Any, chosen: scoring.Candidates, **how: Any) -> scoring.Scores:
+        return scoring.score(field, chosen, params, drive.params.robot, dt=0.1, num_steps=NUM_STEPS, **how)
 
+    pairs = []
+    for seen, state in drive.stops:
+        clear, words = field_of(drive.spec, drive.params, state)
+        window = geometry.window_origin(state.belief.corner, drive.spec.filter.grid)
+        value = GridMap(costmap.unpack(state.plan)[2], window, cell)
+        chosen = _candidates(drive.params, seen, state, 4096)
+        smooth = score((clear, GridMap(state.risk, window, cell), value), chosen, reader=_bilinear)
+        pairs.append((np.asarray(score(words, chosen).score, float), np.asarray(smooth.score, float)))
+
+    words = field_of(drive.spec, drive.params, drive.stops[0][1])[1]
+    sets = {n: _candidates(drive.params, *drive.stops[0], n) for n in (4096, 65536)}
     square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
     matmul = jax.jit(lambda a: a @ a)
-    counts = (4096, 65536)
-    *seconds, reference = _interleaved([*(scores(n) for n in counts), lambda: matmul(square)], repeats)
-    rates = {str(n): n * NUM_STEPS / s for n, s in zip(counts, seconds, strict=True)}
-
-    window = geometry.window_origin(drive.end.belief.corner, drive.spec.filter.grid)
-    cell = drive.spec.filter.grid.resolution
-    value = costmap.unpack(drive.end.plan)[2]
-    layers = (local, GridMap(drive.end.risk, window, cell), GridMap(value, window, cell))
-    ours, smooth = scores(4096)(), scores(4096, layers=layers, reader=_bilinear)()
-    return rates, _difference(ours, smooth), 1e3 * reference
+    calls = [functools.partial(score, words, chosen) for chosen in sets.values()]
+    *seconds, reference = _interleaved([*calls, lambda: matmul(square)], repeats)
+    rates = {str(n): n * NUM_STEPS / s for n, s in zip(sets, seconds, strict=True)}
+    return rates, _difference(pairs), 1e3 * reference
 
 
-def _difference(ours: scoring.Scores, smooth: scoring.Scores) -> dict[str, float]:
-    """How two scores of the same candidates differ; ranks are counted from 0."""
-    a, b = np.asarray(ours.score, float), np.asarray(smooth.score, float)
-    both = (a < scoring.BLOCKED) & (b < scoring.BLOCKED)
+def _difference(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
+    """How scores differ from smooth scores of the same candidates, at several places."""
+    a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    free_a, free_b = a < scoring.BLOCKED, b < scoring.BLOCKED
+    both = free_a & free_b
     error = np.abs(a[both] - b[both])
     relative = error / np.maximum(np.abs(b[both]), 1e-3)
-    best = int(np.argmin(a))
+    chosen = [(smooth[ours.argmin()], smooth) for ours, smooth in pairs]
+    free = [(best, smooth) for best, smooth in chosen if best < scoring.BLOCKED]
     return {
         "median_relative": float(np.median(relative)),
         "p95_relative": float(np.percentile(relative, 95)),
         "median_m": float(np.median(error)),
         "p95_m": float(np.percentile(error, 95)),
-        "rank_of_best": float(np.sum(b < b[best])),
-        "regret_m": float(b[best] - np.min(b)),
-        "blocked_in_one_only": float(np.mean((a < scoring.BLOCKED) != (b < scoring.BLOCKED))),
-        "candidates": float(np.sum(both)),
+        "blocked_in_one_only": float(np.mean(free_a != free_b)),
+        "candidates": a.size,
+        # the choices by the packed scores, judged by the smooth ones; ranks from 0
+        "choices": len(chosen),
+        "choices_blocked": len(chosen) - len(free),
+        "median_rank_of_choice": float(np.median([np.sum(smooth < best) for best, smooth in free])),
+        "median_regret_m": float(np.median([best - smooth.min() for best, smooth in free])),
+        "max_regret_m": float(np.max([best - smooth.min() for best, smooth in free])),
     }
 
 
@@ -301,8 +315,8 @@ def episode_rate(
 ) -> tuple[float, dict[str, int]]:
     """Closed-loop episodes of 600 steps per second, in one batched call after compilation.
 
-    Geometric predictor, 1,024 candidates, worlds of all `FAMILIES` in turn. The robots are so slow (`PACE`) that they are
-    among the obstacles all the time and none arrives.
+    Geometric predictor, 1,024 candidates, worlds of all `FAMILIES` in turn. The robots are so slow (`PACE`) that they
+    are among the obstacles all the time and none arrives.
 
     Args:
         batch: Episodes.
@@ -324,19 +338,16 @@ def episode_rate(
     result = episode.run(spec, policy, params, keys, workers=workers)
     wall = time.perf_counter() - begin
     steps = int(result.log.active.sum())
-    how = {"batch": batch, "steps": steps, "lanes": spec.lanes, "workers": workers}
-    return steps / 600 / wall, how
+    return steps / 600 / wall, {"batch": batch, "steps": steps, "lanes": spec.lanes, "workers": workers}
 
 
 def machine() -> dict[str, Any]:
     """What this was measured on."""
     info = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")] if (
-        info.exists()
-    ) else []
+    named = re.search(r"model name\s*:\s*(.*)", info.read_text() if info.exists() else "")
     return {
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "cpu": names[0] if names else platform.processor() or platform.machine(),
+        "cpu": named[1] if named else platform.processor() or platform.machine(),
         "platform": platform.platform(),
         "device": jax.default_backend(),
         "jax": jax.__version__,
@@ -355,42 +366,32 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
-    drive = record(30 if quick else warm_up + 200)
-    tick = tick_times(drive, warm_up)
+    drive = record(2 * STRIDE if quick else warm_up + 200)
     rates, error, reference = scoring_times(drive, 3 if quick else 50)
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)
     per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
     return {
-        "tick_lidar_ms": tick, "scoring": rates, "scoring_error": error, "lidar": lidar, "episodes_per_s": per_second,
-        "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
+        "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error, "lidar": lidar,
+        "episodes_per_s": per_second, "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
     }  # fmt: skip
 
 
 def table(result: dict[str, Any]) -> str:
     """The result of `run` for people."""
     tick, error, lidar, episodes = (result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "episodes"))
+    rates = {f"scoring, {int(n):,} x {NUM_STEPS}": rate for n, rate in result["scoring"].items()}
     rows = [
         ("tick, 4,096 candidates", f"{tick['median']:.1f} ms median, {tick['p95']:.1f} p95, {tick['max']:.1f} max"),
         ("tick that replans", f"{tick['replan_median']:.1f} ms median, {tick['replan_p95']:.1f} p95"),
-        *(
-            (f"scoring, {int(n):,} x {NUM_STEPS}", f"{rate / 1e6:.0f} M candidate-steps/s")
-            for n, rate in result["scoring"].items()
-        ),
+        *((name, f"{rate / 1e6:.0f} M candidate-steps/s") for name, rate in rates.items()),
         (
             "  against bilinear",
             f"{100 * error['median_relative']:.2f} % median, {100 * error['p95_relative']:.2f} % p95; "
-            f"its best costs {100 * error['regret_m']:.1f} cm more",
+            f"its choices cost {100 * error['median_regret_m']:.1f} cm more (median)",
         ),
-        (
-            "LiDAR 16x360, 100 obstacles",
-            f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo, "
-            f"max error {lidar['max_error_m']:.1e} m",
-        ),
-        (
-            "episodes of 600 steps",
-            f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call, {episodes['lanes']} lanes, "
-            f"{episodes['workers']} workers)",
-        ),
+        ("LiDAR 16x360, 100 obstacles", f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo"),
+        ("  against MuJoCo", f"max error {lidar['max_error_m']:.1e} m"),
+        ("episodes of 600 steps", f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call)"),
         ("matmul 1024^3 float32", f"{result['reference_matmul_ms']:.1f} ms"),
         ("machine", "{cores} x {cpu}, {device}, jax {jax}, python {python}".format(**result["machine"])),
     ]

@@ -79,7 +79,7 @@ def distance_transform(mask: Bool[Array, "H W"], resolution: float, max_distance
     far = (n + 1) ** 2
     # in whole cells: XLA vectorises the least of integers far better than that of floats
     kind = jnp.int16 if 2 * far < 2**15 else jnp.int32
-    padded = once(jnp.pad(jnp.where(mask, kind(0), kind(far)), n, constant_values=far))
+    padded = once(jnp.pad(once(jnp.where(mask, kind(0), kind(far))), n, constant_values=far))
     rows = padded[:, n : n + w]
     for k in range(1, n + 1):
         rows = jnp.minimum(rows, jnp.minimum(padded[:, n - k : n - k + w], padded[:, n + k : n + k + w]) + k * k)

@@ -149,7 +149,7 @@ def observed(
     place = bearing(dx, dy) * turn + offset
     place = jnp.where(place < 0, place + num_bearings, place)
     place = jnp.where(place >= num_bearings, place - num_bearings, place)
-    index = jnp.clip(place.astype(jnp.int32), 0, num_bearings - 1)
+    index = grids.once(jnp.clip(place.astype(jnp.int32), 0, num_bearings - 1))
     limit = least.at[index].get(mode="promise_in_bounds")
     limit = jnp.maximum(limit - params.margin * resolution, params.body_radius)
     return hit, (dx * dx + dy * dy < jnp.square(limit)) & (total == 0)
@@ -230,7 +230,7 @@ def _count(
     shape: tuple[int, int], origin: Array, resolution: Scalar, pose: Array, points: Array, returned: Array
 ) -> Float[Array, "h w"]:
     h, w = shape
-    xy = geometry.transform(pose, jnp.where(returned[:, None], points[:, :2], 0.0))
+    xy = grids.once(geometry.transform(pose, jnp.where(returned[:, None], points[:, :2], 0.0)))
     cell = geometry.cell_of(xy, origin, resolution)
     index = jnp.where(returned & geometry.inside(cell, shape), cell[:, 0] * w + cell[:, 1], h * w)
     return jnp.zeros(h * w, jnp.float32).at[index].add(1.0, mode="drop").reshape(h, w)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from drnav_jax.grids import once
 from drnav_jax.sim.field import wall_distance
 from drnav_jax.types import Scalar
 from drnav_jax.worlds.world import WALL_HEIGHT, World
@@ -244,4 +245,5 @@ def scan(
     beams = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
     sensor = jnp.stack([_f32(0.0), _f32(0.0), _f32(params.height)])
     # Scaling constant beams is 8 times as fast here as stacking three coordinates.
-    return measured * _f32(beams.reshape(-1, 3)) + sensor[None, :], valid.reshape(-1)
+    # Once: each use of a point would draw its noise anew.
+    return once((measured * _f32(beams.reshape(-1, 3)) + sensor[None, :], valid.reshape(-1)))

@@ -1,0 +1,61 @@
+"""`drnav bench`: all figures are there, and those that do not depend on the machine are right."""
+
+import json
+
+import numpy as np
+import pytest
+
+from drnav_jax import bench
+from drnav_jax.planning import scoring
+
+
+@pytest.fixture(scope="module")
+def result():
+    return bench.run(quick=True)
+
+
+def test_every_figure_is_there(result):
+    assert set(result) == {
+        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "episodes_per_s", "episodes", "reference_matmul_ms",
+        "machine",
+    }  # fmt: skip
+    assert {"median", "p95", "max", "replan_p95"} <= set(result["tick_lidar_ms"])
+    assert set(result["scoring"]) == {"4096", "65536"}
+    assert {"rays_per_s", "mujoco_rays_per_s", "ratio", "max_error_m"} <= set(result["lidar"])
+    assert {"cores", "cpu", "jax", "platform", "python"} <= set(result["machine"])
+    assert json.loads(json.dumps(result, allow_nan=False)) == result
+
+
+def test_figures_fit_together(result):
+    tick = result["tick_lidar_ms"]
+    assert 0 < tick["median"] <= tick["p95"] <= tick["max"] and tick["replan_median"] <= tick["replan_p95"]
+    assert min(*result["scoring"].values(), result["episodes_per_s"], result["reference_matmul_ms"]) > 0
+    lidar = result["lidar"]
+    assert lidar["ratio"] == pytest.approx(lidar["rays_per_s"] / lidar["mujoco_rays_per_s"])
+    assert lidar["max_error_m"] < 1e-3 and lidar["mismatches"] == 0
+
+
+def test_nobody_arrives_before_the_time_is_up(result):
+    assert result["episodes"]["steps"] == 50 * result["episodes"]["batch"]
+
+
+def test_packed_words_score_almost_like_float_layers(result):
+    error = result["scoring_error"]
+    assert error["median_relative"] < 0.01 and error["p95_relative"] < 0.05
+    assert error["blocked_in_one_only"] < 0.02
+
+
+def test_difference_is_that_of_the_scores():
+    free = np.asarray([2.0, 4.0, 3.0])
+    one = bench._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([1.5, 1.0]))])
+    assert one["candidates"] == 5 and one["blocked_in_one_only"] == one["choices_blocked"] == 0
+    assert one["max_regret_m"] == 0.5 and one["median_rank_of_choice"] == 0.5
+    blocked = bench._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([scoring.BLOCKED, 1.0]))])
+    assert blocked["blocked_in_one_only"] == 0.2 and blocked["choices_blocked"] == 1
+
+
+def test_table_names_every_part(result):
+    text = bench.table(result)
+    for part in ("tick, 4,096", "tick that replans", "65,536 x 56", "LiDAR", "episodes", "matmul"):
+        assert part in text
+    assert result["machine"]["cpu"] in text
