@@ -28,7 +28,7 @@ from drnav_jax.planning.goal_generator import GeneratorSpec
 from drnav_jax.sim import LidarParams, LidarSpec, cast, episode, kinematic, scan
 from drnav_jax.sim.episode import EpisodeSpec
 from drnav_jax.types import GridMap, Observation, empty_observation
-from drnav_jax.worlds.world import World, no_field
+from drnav_jax.worlds.world import World, make_world
 
 DRIVE = "t"  # family whose world is driven for the recording: corridors, a fork, a dead end
 STRIDE = 20  # ticks of the drive between two places at which candidates are scored
@@ -70,7 +70,7 @@ def random_obstacles(seed: int, num_obstacles: int, extent: float = 20.0, gap: f
     yaw = rng.uniform(-np.pi, np.pi, (num_obstacles, 1))
     boxes = np.concatenate([centre, yaw, half, z], axis=1)[:num_boxes]
     cylinders = np.concatenate([centre, half[:, :1], z], axis=1)[num_boxes:]
-    return World(jnp.asarray(boxes, jnp.float32), jnp.asarray(cylinders, jnp.float32), field=no_field())
+    return jax.tree.map(jnp.asarray, make_world(boxes, cylinders))
 
 
 def native_lidar(spec: LidarSpec, params: LidarParams, world: World, pose: np.ndarray) -> Callable[[], np.ndarray]:

@@ -1,10 +1,11 @@
-"""How far the nearest obstacle is, exactly. All obstacles count, whatever their height."""
+"""How far the nearest obstacle is, exactly. All that stop a robot count, whatever their height."""
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from drnav_jax.geometry import sample_bilinear
+from drnav_jax.worlds.materials import BLOCKS
 from drnav_jax.worlds.world import World
 
 
@@ -30,10 +31,12 @@ def clearance(world: World, xy: Float[Array, "2"]) -> Float[Array, ""]:
         beyond_y = jnp.abs(c * ry - s * rx) - half_y
         outside = jnp.hypot(jnp.maximum(beyond_x, 0.0), jnp.maximum(beyond_y, 0.0))
         inside = jnp.minimum(jnp.maximum(beyond_x, beyond_y), 0.0)
-        nearest = jnp.minimum(nearest, jnp.min(outside + inside))
+        blocks = jnp.asarray(BLOCKS)[world.box_surfaces.material]
+        nearest = jnp.minimum(nearest, jnp.min(jnp.where(blocks, outside + inside, jnp.inf)))
     if world.cylinders.shape[0]:
         x, y, radius = jnp.asarray(world.cylinders, jnp.float32)[:, :3].T
-        nearest = jnp.minimum(nearest, jnp.min(jnp.hypot(xy[0] - x, xy[1] - y) - radius))
+        blocks = jnp.asarray(BLOCKS)[world.cylinder_surfaces.material]
+        nearest = jnp.minimum(nearest, jnp.min(jnp.where(blocks, jnp.hypot(xy[0] - x, xy[1] - y) - radius, jnp.inf)))
     if world.field.values.size:
         field = world.field._replace(values=jnp.asarray(world.field.values, jnp.float32))
         low = jnp.asarray(field.origin, jnp.float32)

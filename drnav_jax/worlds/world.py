@@ -9,13 +9,38 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy import ndimage
 
-from drnav_jax.types import GridMap
+from drnav_jax.types import GridMap, Scalar
+from drnav_jax.worlds.materials import BLOCKS, Material
 
 WALL_HEIGHT = 2.5  # [m] what grid maps are extruded to
 FAR = 1e6  # [m] where padding rows lie: they are never met
+
+
+class Surfaces(NamedTuple):
+    """What N solids are made of."""
+
+    material: Int[Array, " N"]  # `Material`
+    colour: Float[Array, "N 3"]  # albedo, RGB in 0..1
+
+
+class Scenery(NamedTuple):
+    """Ground, sky, light, and what a grid map's walls are made of."""
+
+    ground_material: Scalar = int(Material.CONCRETE)  # [] `Material`
+    ground_colour: Array | tuple = (0.45, 0.45, 0.43)  # [3] albedo
+    wall_material: Scalar = int(Material.WALL)  # [] `Material` of the walls of `World.field`
+    wall_colour: Array | tuple = (0.75, 0.73, 0.68)  # [3] albedo
+    ceiling: Scalar = np.inf  # [] height [m]; inf = open sky
+    ceiling_colour: Array | tuple = (0.85, 0.85, 0.85)  # [3] albedo
+    sun: Array | tuple = (0.48, 0.32, 0.82)  # [3] unit vector towards the light
+    ambient: Scalar = 0.5  # [] share of the light that has no direction, 0..1
+    sky_colour: Array | tuple = (0.55, 0.72, 0.95)  # [3]
+    fog: Scalar = 0.0  # [] extinction of light in the air [1/m]
+    exposure: Scalar = 1.0  # [] gain of the camera
+    texture_seed: Scalar = 0  # [] int: places bricks, spots and stains
 
 
 class World(NamedTuple):
@@ -24,6 +49,9 @@ class World(NamedTuple):
     boxes: Float[Array, "Nb 7"]  # centre x, y, yaw, half length (along yaw), half width, z_min, _max
     cylinders: Float[Array, "Nc 5"]  # centre x, y, radius, z_min, z_max
     field: GridMap  # [H, W] signed distance [m] to a map's walls (< 0 inside); (0, 0) if no map
+    box_surfaces: Surfaces  # of the boxes
+    cylinder_surfaces: Surfaces  # of the cylinders
+    scenery: Scenery
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,6 +90,11 @@ def _float32(values: Any) -> Any:
     return np.asarray(values, np.float32)
 
 
+def _filled(values: Any, shape: tuple[int, ...], dtype: Any) -> Any:
+    """A fresh array of that shape, out of one value for all rows or one for each."""
+    return np.array(np.broadcast_to(np.asarray(values, dtype), shape))
+
+
 def no_field() -> GridMap:
     """The field of a world that is made of boxes and cylinders only."""
     return GridMap(
@@ -69,16 +102,47 @@ def no_field() -> GridMap:
     )
 
 
+def surfaces(count: int, materials: Any = Material.WALL, colours: Any = (0.7, 0.7, 0.7)) -> Surfaces:
+    """Surfaces of `count` solids, from one material and colour for all or one for each."""
+    return Surfaces(material=_filled(materials, (count,), np.int32), colour=_filled(colours, (count, 3), np.float32))
+
+
 def make_world(
     boxes: Sequence | np.ndarray = (),
     cylinders: Sequence | np.ndarray = (),
     field: GridMap | None = None,
+    *,
+    box_surfaces: Surfaces | None = None,
+    cylinder_surfaces: Surfaces | None = None,
+    scenery: Scenery = Scenery(),  # noqa: B008 (immutable)
 ) -> World:
-    """A world on the host (NumPy, float32) out of rows as `World` has them."""
+    """A world on the host (NumPy) out of rows as `World` has them; what has no surface is a grey wall.
+
+    Raises:
+        ValueError: If there are not as many surfaces as solids.
+    """
+    box_rows = _float32(np.reshape(np.asarray(boxes, np.float32), (-1, 7)))
+    cylinder_rows = _float32(np.reshape(np.asarray(cylinders, np.float32), (-1, 5)))
+    of_boxes = surfaces(len(box_rows)) if box_surfaces is None else box_surfaces
+    of_cylinders = surfaces(len(cylinder_rows)) if cylinder_surfaces is None else cylinder_surfaces
+    for name, solids, given in (("box", box_rows, of_boxes), ("cylinder", cylinder_rows, of_cylinders)):
+        if len(given.material) != len(solids) or np.shape(given.colour) != (len(solids), 3):
+            raise ValueError(
+                f"{name}_surfaces must have {len(solids)} rows, one per {name}, got {len(given.material)} materials "
+                f"and colours of shape {np.shape(given.colour)}."
+            )
+    integers = ("ground_material", "wall_material", "texture_seed")
+    lit: Any = {
+        name: np.asarray(value, np.int32 if name in integers else np.float32)
+        for name, value in scenery._asdict().items()
+    }
     return World(
-        boxes=_float32(np.reshape(np.asarray(boxes, np.float32), (-1, 7))),
-        cylinders=_float32(np.reshape(np.asarray(cylinders, np.float32), (-1, 5))),
+        boxes=box_rows,
+        cylinders=cylinder_rows,
         field=no_field() if field is None else field,
+        box_surfaces=of_boxes,
+        cylinder_surfaces=of_cylinders,
+        scenery=Scenery(**lit),
     )
 
 
@@ -105,25 +169,32 @@ def from_grid(occupied: np.ndarray, origin: tuple[float, float], resolution: flo
     return make_world(field=field)
 
 
+def _blocking(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the boxes and of the cylinders that stop a robot, float64."""
+    boxes, cylinders = np.asarray(world.boxes, np.float64), np.asarray(world.cylinders, np.float64)
+    return boxes[BLOCKS[world.box_surfaces.material]], cylinders[BLOCKS[world.cylinder_surfaces.material]]
+
+
 def rasterise(
     world: World, origin: tuple[float, float], shape: tuple[int, int], resolution: float
 ) -> np.ndarray:
-    """Ground truth `[H, W]` of boxes and cylinders: True where a cell's centre is inside one."""
+    """Ground truth `[H, W]`: True where a cell's centre is inside a box or cylinder that stops a robot."""
     x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
     y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
     x, y = x[None, :], y[:, None]
     occupied = np.zeros(shape, bool)
-    for bx, by, yaw, hx, hy, _, _ in np.asarray(world.boxes, np.float64):
+    boxes, cylinders = _blocking(world)
+    for bx, by, yaw, hx, hy, _, _ in boxes:
         c, s = np.cos(yaw), np.sin(yaw)
         along, across = c * (x - bx) + s * (y - by), -s * (x - bx) + c * (y - by)
         occupied |= (np.abs(along) <= hx) & (np.abs(across) <= hy)
-    for cx, cy, r, _, _ in np.asarray(world.cylinders, np.float64):
+    for cx, cy, r, _, _ in cylinders:
         occupied |= (x - cx) ** 2 + (y - cy) ** 2 <= r * r
     return occupied
 
 
 def signed_distance(world: World, points: np.ndarray) -> np.ndarray:
-    """Distance [m] from points to the nearest solid, < 0 inside one; heights are ignored.
+    """Distance [m] from points to the nearest solid that stops a robot, < 0 inside one; heights are ignored.
 
     Args:
         world: One world. Boxes and cylinders are exact, a map's field is interpolated bilinearly.
@@ -134,13 +205,14 @@ def signed_distance(world: World, points: np.ndarray) -> np.ndarray:
     """
     x, y = np.asarray(points, np.float64).reshape(-1, 2).T
     distance = np.full(len(x), FAR)
-    for bx, by, yaw, hx, hy, _, _ in np.asarray(world.boxes, np.float64):
+    boxes, cylinders = _blocking(world)
+    for bx, by, yaw, hx, hy, _, _ in boxes:
         c, s = np.cos(yaw), np.sin(yaw)
         qx = np.abs(c * (x - bx) + s * (y - by)) - hx
         qy = np.abs(-s * (x - bx) + c * (y - by)) - hy
         beyond = np.hypot(np.maximum(qx, 0.0), np.maximum(qy, 0.0))
         np.minimum(distance, beyond + np.minimum(np.maximum(qx, qy), 0.0), out=distance)
-    for cx, cy, r, _, _ in np.asarray(world.cylinders, np.float64):
+    for cx, cy, r, _, _ in cylinders:
         np.minimum(distance, np.hypot(x - cx, y - cy) - r, out=distance)
     field = np.asarray(world.field.values, np.float64)
     if field.size:
@@ -150,6 +222,10 @@ def signed_distance(world: World, points: np.ndarray) -> np.ndarray:
         sampled = ndimage.map_coordinates(field, cell, order=1, mode="nearest")
         np.minimum(distance, sampled, out=distance)
     return distance
+
+
+def _stacked(arrays: Sequence) -> Any:
+    return np.stack([np.asarray(a) for a in arrays])
 
 
 def stack_worlds(worlds: list[World]) -> World:
@@ -172,6 +248,14 @@ def stack_worlds(worlds: list[World]) -> World:
             out[k, : len(getattr(w, name))] = getattr(w, name)
         return out
 
+    def looks(name: str) -> Any:
+        count = max(len(getattr(w, name).material) for w in worlds)
+        filled: list[Any] = [surfaces(count) for _ in worlds]
+        for out, world in zip(filled, worlds, strict=True):
+            given = getattr(world, name)
+            out.material[: len(given.material)], out.colour[: len(given.colour)] = given
+        return Surfaces(*(_stacked(parts) for parts in zip(*filled, strict=True)))
+
     h, w = (max(world.field.values.shape[a] for world in worlds) for a in (0, 1))
     fields = []
     for world in worlds:
@@ -188,4 +272,7 @@ def stack_worlds(worlds: list[World]) -> World:
             origin=_float32([x.field.origin for x in worlds]),
             resolution=_float32([x.field.resolution for x in worlds]),
         ),
+        box_surfaces=looks("box_surfaces"),
+        cylinder_surfaces=looks("cylinder_surfaces"),
+        scenery=Scenery(*(_stacked(parts) for parts in zip(*(w.scenery for w in worlds), strict=True))),
     )

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drnav_jax import bench, sim
-from drnav_jax.worlds.world import World, from_grid, no_field, rasterise, stack_worlds
+from drnav_jax.worlds.world import World, from_grid, make_world, rasterise, stack_worlds
 
 SAMPLES = 4000  # points per obstacle: about 1 mm apart
 TOLERANCE = 1e-4  # [m] the gap between two samples seen from 0.05 m, and float32
@@ -47,7 +47,7 @@ def test_boxes_and_cylinders():
 def test_the_depth_inside_a_box_and_a_cylinder():
     box = np.asarray([[1.0, 2.0, np.pi / 2, 3.0, 1.0, 0.0, 1.0]], np.float32)
     post = np.asarray([[8.0, 2.0, 0.5, 0.0, 1.0]], np.float32)
-    world = jax.tree.map(jnp.asarray, World(box, post, no_field()))
+    world = jax.tree.map(jnp.asarray, make_world(box, post))
     for xy, depth in (([1.7, 2.0], -0.3), ([1.0, 4.9], -0.1), ([8.1, 2.0], -0.4)):
         np.testing.assert_allclose(sim.clearance(world, jnp.asarray(xy)), depth, atol=1e-6)
 
@@ -70,8 +70,7 @@ def test_grid_maps_within_and_beyond_the_edge():
 
 
 def test_nothing_near():
-    empty = World(np.zeros((0, 7), np.float32), np.zeros((0, 5), np.float32), no_field())
-    empty = jax.tree.map(jnp.asarray, empty)
+    empty = jax.tree.map(jnp.asarray, make_world())
     assert np.isinf(sim.clearance(empty, jnp.zeros(2)))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from drnav_jax import bench, sim
 from drnav_jax.sim.lidar import HIT_MARGIN
-from drnav_jax.worlds.world import World, from_grid, no_field, stack_worlds
+from drnav_jax.worlds.world import World, from_grid, make_world, stack_worlds
 
 # float32 distances over 30 m, where a ray touches a curved side: measured 2.4e-4 m over 100 worlds.
 MAX_ERROR = 1e-3
@@ -18,11 +18,7 @@ ORIGIN = np.zeros(3, np.float32)
 
 
 def world_of(boxes=(), cylinders=(), field=None) -> World:
-    return World(
-        np.asarray(boxes, np.float32).reshape(-1, 7),
-        np.asarray(cylinders, np.float32).reshape(-1, 5),
-        no_field() if field is None else field,
-    )
+    return make_world(np.asarray(boxes).reshape(-1, 7), np.asarray(cylinders).reshape(-1, 5), field)
 
 
 def cast(spec, world, pose=ORIGIN, **params) -> np.ndarray:

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from drnav_jax.types import GridMap
 from drnav_jax.worlds import (
     Scene,
-    World,
     check_trip,
     from_grid,
-    no_field,
+    make_world,
     rasterise,
     sample_trips,
     shortest_path,
@@ -64,7 +63,7 @@ def test_path_around_a_wall_is_the_taut_string(start, goal, clearance):
 
 
 def test_path_around_a_cylinder_keeps_the_exact_clearance():
-    world = World(np.zeros((0, 7), np.float32), np.array([[5, 5, 1, 0, 2]], np.float32), no_field())
+    world = make_world(cylinders=[[5, 5, 1, 0, 2]])
     occupied = rasterise(world, (0.0, 0.0), (100, 100), 0.1)
     scene = Scene("pillar", world, occupied, (0.0, 0.0), 0.1)
     length, path = shortest_path(scene, (1.0, 5.0), (9.0, 5.0), 0.4)

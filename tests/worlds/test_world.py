@@ -1,3 +1,4 @@
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -5,7 +6,6 @@ from hypothesis import strategies as st
 
 from drnav_jax.worlds import (
     FAR,
-    World,
     distance_field,
     from_grid,
     make_world,
@@ -94,7 +94,7 @@ def test_stacked_worlds_meet_nothing_new():
     assert batch.boxes.shape == (2, 3, 7) and batch.cylinders.shape == (2, 2, 5)
     points = np.random.default_rng(1).uniform(-5, 5, (50, 2))
     for k, world in enumerate(worlds):
-        one = World(batch.boxes[k], batch.cylinders[k], no_field())
+        one = jax.tree.map(lambda a, k=k: a[k], batch)._replace(field=no_field())
         np.testing.assert_allclose(signed_distance(one, points), signed_distance(world, points))
 
 
