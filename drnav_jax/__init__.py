@@ -8,21 +8,39 @@ Pure, jittable functions for one robot; the caller vmaps. The parts are in the s
 
 from drnav_jax import evaluate, filter, geometry, grids, metrics, models, navigator, planning, sim, types, worlds
 from drnav_jax.navigator import Info, NavParams, NavSpec, NavState, init, step
-from drnav_jax.types import Command, Evidence, GridMap, GridSpec, LocalMap, Observation, RobotParams, empty_observation
+from drnav_jax.types import (
+    BevSpec,
+    CameraRig,
+    Command,
+    Evidence,
+    GridMap,
+    GridSpec,
+    LocalMap,
+    Mount,
+    Observation,
+    RigSpec,
+    RobotParams,
+    empty_observation,
+    rig_of,
+)
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "BevSpec",
+    "CameraRig",
     "Command",
     "Evidence",
     "GridMap",
     "GridSpec",
     "Info",
     "LocalMap",
+    "Mount",
     "NavParams",
     "NavSpec",
     "NavState",
     "Observation",
+    "RigSpec",
     "RobotParams",
     "empty_observation",
     "evaluate",
@@ -34,6 +52,7 @@ __all__ = [
     "models",
     "navigator",
     "planning",
+    "rig_of",
     "sim",
     "step",
     "types",

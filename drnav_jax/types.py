@@ -5,9 +5,11 @@ Units are metres, seconds and radians. A grid is `[H, W]`: row = y, column = x, 
 """
 
 import dataclasses
+import math
 from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 Scalar: TypeAlias = int | float | Array
@@ -57,6 +59,114 @@ class GridMap(NamedTuple):
     resolution: Scalar  # [] edge of a cell [m]
 
 
+@dataclasses.dataclass(frozen=True)
+class BevSpec:
+    """The bird's-eye grid in `base_link` on which frames are labelled and the network predicts: row = +y, column = +x.
+
+    Attributes:
+        shape: (h, w) cells.
+        resolution: Edge of a cell [m].
+        ahead: How far the grid's centre lies in front of the robot [m].
+    """
+
+    shape: tuple[int, int] = (64, 64)
+    resolution: float = 0.2
+    ahead: float = 3.2
+
+    def __post_init__(self) -> None:
+        """Check sizes."""
+        if min(self.shape) < 1 or self.resolution <= 0:
+            raise ValueError(f"shape must be >= 1 cell and resolution > 0 m, got {self.shape} and {self.resolution}.")
+
+    @property
+    def origin(self) -> tuple[float, float]:
+        """base_link x, y of the outer corner of cell (0, 0) [m]."""
+        h, w = self.shape
+        return self.ahead - w * self.resolution / 2, -h * self.resolution / 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Mount:
+    """One pinhole camera on the robot: where it sits in `base_link` and where it looks.
+
+    Attributes:
+        x: Forward [m].
+        y: To the left [m].
+        z: Above the ground [m].
+        yaw: To the left of straight ahead [rad].
+        pitch: Downwards [rad].
+        roll: About the optical axis [rad].
+        fov: Horizontal field of view [rad].
+    """
+
+    x: float = 0.1
+    y: float = 0.0
+    z: float = 0.5
+    yaw: float = 0.0
+    pitch: float = 0.0
+    roll: float = 0.0
+    fov: float = math.pi / 2
+
+    def __post_init__(self) -> None:
+        """Check the field of view and the height."""
+        if not 0 < self.fov < math.pi:
+            raise ValueError(f"fov must lie in (0, pi) rad, got {self.fov}.")
+        if self.z <= 0:
+            raise ValueError(f"a camera sits above the ground: z must be > 0 m, got {self.z}.")
+
+
+FRONT_LEFT_RIGHT = (Mount(), Mount(x=0.0, y=0.1, yaw=math.pi / 2), Mount(x=0.0, y=-0.1, yaw=-math.pi / 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class RigSpec:
+    """The cameras of a robot, and the size of their images.
+
+    Attributes:
+        mounts: N cameras; default front, left and right.
+        shape: (h, w) of an image [pixels].
+    """
+
+    mounts: tuple[Mount, ...] = FRONT_LEFT_RIGHT
+    shape: tuple[int, int] = (96, 96)
+
+    def __post_init__(self) -> None:
+        """Check sizes."""
+        if min(self.shape) < 1:
+            raise ValueError(f"an image must be >= 1 pixel wide and high, got {self.shape}.")
+
+
+class CameraRig(NamedTuple):
+    """Geometry of N cameras as arrays. Optical frame: x right, y down, z along the view (REP-103 `_optical`)."""
+
+    focal: Array  # [N, 2] focal lengths fx, fy [pixels]
+    centre: Array  # [N, 2] principal point cx, cy; the outer corner of the first pixel is (0, 0) [pixels]
+    position: Array  # [N, 3] of the optical centre in base_link [m]
+    rotation: Array  # [N, 3, 3] takes directions from the optical frame to base_link
+
+
+def rig_of(spec: RigSpec) -> CameraRig:
+    """The arrays (float32) of a rig with square pixels and the principal point in the middle."""
+    h, w = spec.shape
+    focal, rotation = [], []
+    for mount in spec.mounts:
+        focal.append([0.5 * w / math.tan(mount.fov / 2)] * 2)
+        cy, sy, cp, sp = math.cos(mount.yaw), math.sin(mount.yaw), math.cos(mount.pitch), math.sin(mount.pitch)
+        cr, sr = math.cos(mount.roll), math.sin(mount.roll)
+        yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        roll = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        optical = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # columns: right, down, along the view
+        rotation.append(yaw @ pitch @ roll @ optical)
+    count = len(spec.mounts)
+    return CameraRig(
+        focal=jnp.asarray(np.reshape(focal, (count, 2)), jnp.float32),
+        centre=jnp.asarray(np.tile([[0.5 * w, 0.5 * h]], (count, 1)), jnp.float32),
+        position=jnp.asarray(np.reshape([[m.x, m.y, m.z] for m in spec.mounts], (count, 3)), jnp.float32),
+        rotation=jnp.asarray(np.reshape(rotation, (count, 3, 3)), jnp.float32),
+    )
+
+
 class Observation(NamedTuple):
     """What the sensors say at one tick. Missing sensors are masks, never exceptions.
 
@@ -73,21 +183,25 @@ class Observation(NamedTuple):
     goal: Array  # [2] x, y in odom [m]
     image_age: Array  # [N] time since capture [s]
     point_age: Array  # [] time since the scan [s]
+    rig: CameraRig  # where the cameras sit and look
 
 
-def empty_observation(num_points: int, num_cameras: int = 0, image_shape: tuple[int, int] = (96, 96)) -> Observation:
+NO_CAMERAS = RigSpec(mounts=())
+
+
+def empty_observation(num_points: int, rig: RigSpec = NO_CAMERAS) -> Observation:
     """An observation of the given sizes in which every sensor is missing.
 
     Args:
         num_points: P, number of LiDAR points.
-        num_cameras: N, number of cameras.
-        image_shape: (h, w) of an image.
+        rig: The cameras.
 
     Raises:
         ValueError: If a size is negative.
     """
-    if min(num_points, num_cameras, *image_shape) < 0:
-        raise ValueError(f"sizes must be >= 0, got {num_points} points, {num_cameras} cameras, images {image_shape}.")
+    if num_points < 0:
+        raise ValueError(f"num_points must be >= 0, got {num_points}.")
+    num_cameras, image_shape = len(rig.mounts), rig.shape
     return Observation(
         images=jnp.zeros((num_cameras, *image_shape, 3), jnp.float32),
         image_valid=jnp.zeros(num_cameras, bool),
@@ -98,6 +212,7 @@ def empty_observation(num_points: int, num_cameras: int = 0, image_shape: tuple[
         goal=jnp.zeros(2, jnp.float32),
         image_age=jnp.zeros(num_cameras, jnp.float32),
         point_age=jnp.zeros((), jnp.float32),
+        rig=rig_of(rig),
     )
 
 

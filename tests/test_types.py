@@ -1,9 +1,13 @@
 """What the containers refuse, and what an empty observation is."""
 
+import math
+
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from drnav_jax.types import GridSpec, empty_observation
+from drnav_jax.types import FRONT_LEFT_RIGHT, BevSpec, GridSpec, Mount, RigSpec, empty_observation, rig_of
 
 
 @pytest.mark.parametrize(
@@ -27,10 +31,40 @@ def test_specs_are_keys():
 
 
 def test_an_empty_observation_is_all_masks():
-    seen = empty_observation(5, num_cameras=2, image_shape=(3, 4))
+    seen = empty_observation(5, RigSpec(FRONT_LEFT_RIGHT[:2], shape=(3, 4)))
     assert seen.points.shape == (5, 3) and seen.images.shape == (2, 3, 4, 3)
     assert not bool(jnp.any(seen.point_valid)) and not bool(jnp.any(seen.image_valid))
-    assert all(a.dtype in (jnp.float32, bool) for a in seen)
+    assert all(a.dtype in (jnp.float32, bool) for a in jax.tree.leaves(seen))
     assert empty_observation(0).points.shape == (0, 3)
-    with pytest.raises(ValueError, match="sizes must be >= 0"):
+    with pytest.raises(ValueError, match="num_points must be >= 0"):
         empty_observation(-1)
+
+
+def test_a_rig_looks_where_its_mounts_say():
+    down = Mount(x=0.2, y=-0.1, z=0.6, yaw=0.3, pitch=0.4, fov=math.radians(60))
+    rig = rig_of(RigSpec((*FRONT_LEFT_RIGHT, down, Mount(roll=0.2)), shape=(30, 40)))
+    view, right, below = (np.asarray(rig.rotation[:, :, k]) for k in (2, 0, 1))
+    np.testing.assert_allclose(view[:3], [[1, 0, 0], [0, 1, 0], [0, -1, 0]], atol=1e-6)
+    np.testing.assert_allclose(right[0], [0, -1, 0], atol=1e-6)
+    np.testing.assert_allclose(below[:3], [[0, 0, -1]] * 3, atol=1e-6)
+    expected = [math.cos(0.4) * math.cos(0.3), math.cos(0.4) * math.sin(0.3), -math.sin(0.4)]
+    np.testing.assert_allclose(view[3], expected, atol=1e-6)
+    np.testing.assert_allclose(rig.position[3], [0.2, -0.1, 0.6])
+    assert right[4][2] < 0  # rolled to the right
+    np.testing.assert_allclose(rig.focal[:, 0], [20, 20, 20, 20 / math.tan(math.radians(30)), 20], rtol=1e-6)
+    np.testing.assert_allclose(rig.centre[0], [20, 15])
+    eye = np.einsum("nij,nik->njk", rig.rotation, rig.rotation)
+    np.testing.assert_allclose(eye, np.broadcast_to(np.eye(3), eye.shape), atol=1e-6)
+    np.testing.assert_allclose(np.linalg.det(np.asarray(rig.rotation)), 1.0, atol=1e-6)
+
+
+def test_the_birds_eye_grid_lies_ahead():
+    assert BevSpec(shape=(4, 6), resolution=0.5, ahead=1.0).origin == (-0.5, -1.0)
+    with pytest.raises(ValueError, match="resolution > 0 m"):
+        BevSpec(resolution=0.0)
+
+
+@pytest.mark.parametrize(("field", "message"), [({"fov": 3.2}, "fov must lie in"), ({"z": 0.0}, "z must be > 0 m")])
+def test_a_camera_that_cannot_be_is_refused(field, message):
+    with pytest.raises(ValueError, match=message):
+        Mount(**field)
