@@ -113,3 +113,30 @@ def test_an_interrupt_keeps_what_is_finished():
 def test_nothing_to_drive():
     with pytest.raises(ValueError, match="no trip"):
         evaluate.evaluate([], evaluate.Setup())
+
+
+def whole_episodes(families, seeds, lanes):
+    scenes = [worlds.sample(family, seed) for family in families for seed in seeds]
+    trips = evaluate.prepare(scenes, evaluate.Setup())
+    found = evaluate.evaluate(trips, evaluate.Setup(), spec=dataclasses.replace(SPEC, lanes=lanes))
+    assert not found.interrupted and len(found.records) == len(scenes)
+    return found.records
+
+
+def agree(singles, batched, share):
+    """Outcomes agree in all episodes, times within 2 % in `share` of them (a tie of floats may fall either way)."""
+    for name in ("world", "success", "collision"):
+        assert [r[name] for r in singles] == [r[name] for r in batched]
+    assert all(r["success"] for r in singles)
+    a, b = (np.array([r["time_s"] for r in records]) for records in (singles, batched))
+    assert np.mean(np.abs(a - b) <= 0.02 * a) >= share
+
+
+def test_an_episode_in_a_batch_goes_as_it_goes_alone():
+    agree(whole_episodes(["u", "t"], [3], 1), whole_episodes(["u", "t"], [3], 2), 1.0)
+
+
+@pytest.mark.slow
+def test_many_episodes_in_a_batch_go_as_they_go_alone():
+    families, seeds = ["u", "t", "l", "corridor", "open"], range(8)
+    agree(whole_episodes(families, seeds, 1), whole_episodes(families, seeds, 8), 0.95)
