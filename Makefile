@@ -47,7 +47,7 @@ bench: $(STAMP)  ## times of the parts, next to a fixed matmul
 # One version of each package for every Python (fewest), or the lock would hold a jax that nobody tested.
 # Pins already in the lock stay; LOCK_ARGS=--upgrade moves them, LOCK_ARGS="--upgrade-package jax" one.
 lock: $(STAMP)  ## resolve requirements.lock anew
-	$(BIN)/uv pip compile pyproject.toml --extra viz --extra test --extra dev \
+	$(BIN)/uv pip compile pyproject.toml --extra train --extra viz --extra test --extra dev \
 		--universal --python-version 3.11 --fork-strategy fewest \
 		--generate-hashes --no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" \
 		--quiet --output-file requirements.lock $(LOCK_ARGS)
