@@ -1,4 +1,4 @@
-"""How far the nearest obstacle is, exactly. All that stop a robot count, whatever their height."""
+"""How far the nearest obstacle is, exactly. All that stop a robot count, but for what it passes under."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from drnav_jax.geometry import sample_bilinear
 from drnav_jax.worlds.materials import BLOCKS
-from drnav_jax.worlds.world import World
+from drnav_jax.worlds.world import HEADROOM, World
 
 
 @jax.jit
@@ -25,17 +25,17 @@ def clearance(world: World, xy: Float[Array, "2"]) -> Float[Array, ""]:
     """
     nearest = jnp.asarray(jnp.inf, jnp.float32)
     if world.boxes.shape[0]:
-        x, y, yaw, half_x, half_y = jnp.asarray(world.boxes, jnp.float32)[:, :5].T
+        x, y, yaw, half_x, half_y, z_min = jnp.asarray(world.boxes, jnp.float32)[:, :6].T
         c, s, rx, ry = jnp.cos(yaw), jnp.sin(yaw), xy[0] - x, xy[1] - y
         beyond_x = jnp.abs(c * rx + s * ry) - half_x
         beyond_y = jnp.abs(c * ry - s * rx) - half_y
         outside = jnp.hypot(jnp.maximum(beyond_x, 0.0), jnp.maximum(beyond_y, 0.0))
         inside = jnp.minimum(jnp.maximum(beyond_x, beyond_y), 0.0)
-        blocks = jnp.asarray(BLOCKS)[world.box_surfaces.material]
+        blocks = jnp.asarray(BLOCKS)[world.box_surfaces.material] & (z_min < HEADROOM)
         nearest = jnp.minimum(nearest, jnp.min(jnp.where(blocks, outside + inside, jnp.inf)))
     if world.cylinders.shape[0]:
-        x, y, radius = jnp.asarray(world.cylinders, jnp.float32)[:, :3].T
-        blocks = jnp.asarray(BLOCKS)[world.cylinder_surfaces.material]
+        x, y, radius, z_min = jnp.asarray(world.cylinders, jnp.float32)[:, :4].T
+        blocks = jnp.asarray(BLOCKS)[world.cylinder_surfaces.material] & (z_min < HEADROOM)
         nearest = jnp.minimum(nearest, jnp.min(jnp.where(blocks, jnp.hypot(xy[0] - x, xy[1] - y) - radius, jnp.inf)))
     if world.field.values.size:
         field = world.field._replace(values=jnp.asarray(world.field.values, jnp.float32))

@@ -8,6 +8,7 @@ from drnav_jax.worlds.moving_ai import ScenarioTrip, load_moving_ai, load_scenar
 from drnav_jax.worlds.trips import check_trip, sample_trips, shortest_path, trip_cells
 from drnav_jax.worlds.world import (
     FAR,
+    HEADROOM,
     WALL_HEIGHT,
     Scene,
     Scenery,
@@ -29,6 +30,7 @@ __all__ = [
     "FAMILIES",
     "FAR",
     "FLOORS",
+    "HEADROOM",
     "SPLITS",
     "WALL_HEIGHT",
     "Material",

@@ -16,6 +16,7 @@ from drnav_jax.types import GridMap, Scalar
 from drnav_jax.worlds.materials import BLOCKS, Material
 
 WALL_HEIGHT = 2.5  # [m] what grid maps are extruded to
+HEADROOM = 1.5  # [m] a robot passes under what begins higher: lintels, tree tops
 FAR = 1e6  # [m] where padding rows lie: they are never met
 
 
@@ -70,6 +71,11 @@ class Scene:
         time_limit: Seconds allowed; None = the default rule.
         reference_length: Length [m] of the source's own reference path (BARN, Moving AI), or None.
         outside_is_free: Whether one may drive beyond the grid's edge (open field) or not (maps).
+        family: Seeded family that it is of, or None.
+        split: Split that its family and seed are of, or None.
+        twin: Name of the world, of the same split, that differs in one way being open or closed; None if there is none.
+        closed: Whether that way is closed here; False if there is no twin.
+        strata: What is in the world or its twin that one sensor alone cannot judge: of "drop", "glass", "vegetation".
     """
 
     name: str
@@ -83,6 +89,11 @@ class Scene:
     time_limit: float | None = None
     reference_length: float | None = None
     outside_is_free: bool = True
+    family: str | None = None
+    split: str | None = None
+    twin: str | None = None
+    closed: bool = False
+    strata: tuple[str, ...] = ()
 
 
 def _float32(values: Any) -> Any:
@@ -172,13 +183,19 @@ def from_grid(occupied: np.ndarray, origin: tuple[float, float], resolution: flo
 def _blocking(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the boxes and of the cylinders that stop a robot, float64."""
     boxes, cylinders = np.asarray(world.boxes, np.float64), np.asarray(world.cylinders, np.float64)
-    return boxes[BLOCKS[world.box_surfaces.material]], cylinders[BLOCKS[world.cylinder_surfaces.material]]
+    return (
+        boxes[BLOCKS[world.box_surfaces.material] & (boxes[:, 5] < HEADROOM)],
+        cylinders[BLOCKS[world.cylinder_surfaces.material] & (cylinders[:, 3] < HEADROOM)],
+    )
 
 
 def rasterise(
     world: World, origin: tuple[float, float], shape: tuple[int, int], resolution: float
 ) -> np.ndarray:
-    """Ground truth `[H, W]`: True where a cell's centre is inside a box or cylinder that stops a robot."""
+    """Ground truth `[H, W]`: True where a cell's centre is inside a box or cylinder that stops a robot.
+
+    A box thinner than a cell, such as a pane, counts as one cell thick: else it could lie between the centres.
+    """
     x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
     y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
     x, y = x[None, :], y[:, None]
@@ -187,14 +204,14 @@ def rasterise(
     for bx, by, yaw, hx, hy, _, _ in boxes:
         c, s = np.cos(yaw), np.sin(yaw)
         along, across = c * (x - bx) + s * (y - by), -s * (x - bx) + c * (y - by)
-        occupied |= (np.abs(along) <= hx) & (np.abs(across) <= hy)
+        occupied |= (np.abs(along) <= max(hx, resolution / 2)) & (np.abs(across) <= max(hy, resolution / 2))
     for cx, cy, r, _, _ in cylinders:
         occupied |= (x - cx) ** 2 + (y - cy) ** 2 <= r * r
     return occupied
 
 
 def signed_distance(world: World, points: np.ndarray) -> np.ndarray:
-    """Distance [m] from points to the nearest solid that stops a robot, < 0 inside one; heights are ignored.
+    """Distance [m] from points to the nearest solid that stops a robot, < 0 inside one; only `HEADROOM` counts of heights.
 
     Args:
         world: One world. Boxes and cylinders are exact, a map's field is interpolated bilinearly.

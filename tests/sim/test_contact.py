@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drnav_jax import bench, sim
-from drnav_jax.worlds.world import World, from_grid, make_world, rasterise, stack_worlds
+from drnav_jax.worlds.world import HEADROOM, World, from_grid, make_world, rasterise, stack_worlds
 
 SAMPLES = 4000  # points per obstacle: about 1 mm apart
 TOLERANCE = 1e-4  # [m] the gap between two samples seen from 0.05 m, and float32
@@ -86,3 +86,8 @@ def test_padding_does_not_count_and_a_batch_compiles_once():
     for xy in (jnp.zeros(2), jnp.asarray([3.0, -2.0])):
         single = [sim.clearance(jax.tree.map(jnp.asarray, w), xy) for w in worlds]
         np.testing.assert_allclose(both(xy), np.asarray(single), atol=1e-6)
+
+
+def test_what_a_robot_passes_under_is_no_contact():
+    solids = [[1, 0, 0, 0.5, 0.5, HEADROOM, 2.5]], [[-1, 0, 0.5, HEADROOM, 2.5]]
+    assert np.isinf(sim.clearance(jax.tree.map(jnp.asarray, make_world(*solids)), jnp.zeros(2, jnp.float32)))

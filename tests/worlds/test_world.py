@@ -3,9 +3,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from drnav_jax.worlds import (
     FAR,
+    HEADROOM,
     distance_field,
     from_grid,
     make_world,
@@ -113,3 +115,22 @@ def test_stack_worlds_says_what_does_not_batch():
         stack_worlds([])
     with pytest.raises(ValueError, match="run them separately"):
         stack_worlds([make_world(), from_grid(np.eye(3, dtype=bool), (0.0, 0.0), 0.1)])
+
+
+def test_a_lintel_a_robot_passes_under_and_a_low_bar_it_does_not():
+    lintel = [[1, 0, 0, 0.5, 0.1, HEADROOM, 2.5]]
+    bar = [[1, 0, 0, 0.5, 0.1, HEADROOM - 0.1, 2.5]]
+    assert not rasterise(make_world(lintel), (0.0, -1.0), (20, 20), 0.1).any()
+    assert signed_distance(make_world(lintel), np.zeros((1, 2))) == FAR
+    assert rasterise(make_world(bar), (0.0, -1.0), (20, 20), 0.1).any()
+    crown = [[1, 0, 0.5, HEADROOM, 3]]
+    assert signed_distance(make_world(cylinders=crown), np.zeros((1, 2))) == FAR
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.01, 0.5, np.pi / 2])
+@pytest.mark.parametrize("shift", np.linspace(0, 0.1, 5))
+def test_a_thin_pane_lets_nobody_through_its_cells(yaw, shift):
+    pane = make_world([[shift, shift, yaw, 5.0, 0.01, 0, 2.5]])
+    occupied = rasterise(pane, (-2.0, -2.0), (40, 40), 0.1)
+    _, parts = ndimage.label(~occupied)  # 4-connected
+    assert parts == 2
