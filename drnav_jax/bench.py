@@ -1,18 +1,15 @@
 """Times of the parts next to their rivals, measured in turn within one run.
 
 What is timed: the robot's whole tick on a recorded drive, the scoring of candidates in the field of that drive, the
-LiDAR against native MuJoCo, and batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from
-slow code.
+LiDAR and the cameras against native MuJoCo (`bench_sensors`), and batched closed-loop episodes. A fixed matmul from the
+same run tells a slow hour from slow code.
 """
 
 import functools
-import importlib
 import os
 import platform
 import re
-import statistics
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,144 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from drnav_jax import evaluate, geometry, navigator, worlds
+from drnav_jax.bench_sensors import camera_against_mujoco, interleaved, lidar_against_mujoco
 from drnav_jax.evaluate import Setup
 from drnav_jax.navigator import NavParams, NavSpec, NavState
 from drnav_jax.planning import costmap, goal_generator, scoring
 from drnav_jax.planning.goal_generator import GeneratorSpec
-from drnav_jax.sim import LidarParams, LidarSpec, cast, episode, kinematic, scan
+from drnav_jax.sim import LidarParams, LidarSpec, episode, kinematic, scan
 from drnav_jax.sim.episode import EpisodeSpec
 from drnav_jax.types import GridMap, Observation, empty_observation
-from drnav_jax.worlds.world import World, make_world
 
 DRIVE = "t"  # family whose world is driven for the recording: corridors, a fork, a dead end
 STRIDE = 20  # ticks of the drive between two places at which candidates are scored
 FAMILIES = ("u", "t", "l", "corridor", "open")  # of the batched episodes, in turn
 NUM_STEPS = 56  # T of the scoring
 PACE = 0.2  # [m/s] limit of the batched episodes, so that none arrives within its 600 steps
-
-
-def _interleaved(calls: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median time [s] of each call; the calls take turns, so that a slow moment hits them all."""
-    times: list[list[float]] = [[] for _ in calls]
-    for k in range(repeats + 1):
-        for call, spent in zip(calls, times, strict=True):
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            if k:  # the first round warms up
-                spent.append(time.perf_counter() - start)
-    return [statistics.median(spent) for spent in times]
-
-
-def random_obstacles(seed: int, num_obstacles: int, extent: float = 20.0, gap: float = 0.5) -> World:
-    """A world of boxes at all angles and cylinders, half of each, around a free origin.
-
-    Args:
-        seed: Of the world.
-        num_obstacles: How many in all.
-        extent: Half the edge of the square that they fill [m].
-        gap: Free distance around the origin [m].
-    """
-    rng = np.random.default_rng(seed)
-    num_boxes = num_obstacles // 2
-    half = rng.uniform(0.1, 1.5, (num_obstacles, 2))
-    radius = np.where(np.arange(num_obstacles) < num_boxes, np.hypot(*half.T), half[:, 0])
-    centre = rng.uniform(-extent, extent, (num_obstacles, 2))
-    near = np.hypot(*centre.T) < radius + gap
-    centre[near] *= ((radius + gap + extent / 2) / np.hypot(*centre.T))[near, None]
-    low = np.where(rng.random(num_obstacles) < 0.25, rng.uniform(0.0, 1.0, num_obstacles), 0.0)
-    z = np.stack([low, low + rng.uniform(0.2, 2.5, num_obstacles)], axis=1)
-    yaw = rng.uniform(-np.pi, np.pi, (num_obstacles, 1))
-    boxes = np.concatenate([centre, yaw, half, z], axis=1)[:num_boxes]
-    cylinders = np.concatenate([centre, half[:, :1], z], axis=1)[num_boxes:]
-    return jax.tree.map(jnp.asarray, make_world(boxes, cylinders))
-
-
-def native_lidar(spec: LidarSpec, params: LidarParams, world: World, pose: np.ndarray) -> Callable[[], np.ndarray]:
-    """The rays of `sim.cast` in native MuJoCo (`mj_multiRay`), ready to be cast again and again.
-
-    Args:
-        spec: The beams.
-        params: Range and mounting height.
-        world: Boxes and cylinders; a field is not looked at.
-        pose: x, y, yaw of `base_link` [m, rad].
-
-    Returns:
-        A function that casts all rays and returns ranges [m], `[rings, azimuths]`; inf where
-        nothing is met. The array is the same at each call.
-    """
-    # Imported when it is used, and by name: pyright does not see into its C++ module.
-    mujoco: Any = importlib.import_module("mujoco")
-    scene = mujoco.MjSpec()
-    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[200, 200, 1])
-    for x, y, yaw, half_x, half_y, low, high in np.asarray(world.boxes, float):
-        scene.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[x, y, (low + high) / 2],
-            size=[half_x, half_y, (high - low) / 2],
-            quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)],
-        )
-    for x, y, radius, low, high in np.asarray(world.cylinders, float):
-        scene.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[x, y, (low + high) / 2],
-            size=[radius, (high - low) / 2, 0],
-        )
-    model = scene.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-
-    e, a = np.meshgrid(spec.elevations, spec.bearings + float(pose[2]), indexing="ij")
-    rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1)
-    sensor = np.asarray([pose[0], pose[1], params.height], float)
-    limit = float(params.max_range)
-    met, ranges = np.zeros(spec.num_points, np.int32), np.zeros(spec.num_points)
-
-    def cast_native() -> np.ndarray:
-        mujoco.mj_multiRay(model, data, sensor, rays, None, 1, -1, met, ranges, None, spec.num_points, limit)
-        ranges[met < 0] = np.inf
-        return ranges.reshape(spec.rings, spec.azimuths)
-
-    return cast_native
-
-
-def lidar_against_mujoco(
-    seed: int = 0, num_obstacles: int = 100, rings: int = 16, azimuths: int = 360, repeats: int = 30
-) -> dict[str, float]:
-    """Our LiDAR and native `mj_multiRay` on the same rays, world and pose.
-
-    The native one runs on the calling thread, as it comes; ours on what XLA uses.
-
-    Args:
-        seed: Of the world.
-        num_obstacles: Boxes and cylinders.
-        rings: Rays stacked in elevation.
-        azimuths: Rays in one turn.
-        repeats: How often each is timed.
-
-    Returns:
-        `rays_per_s` and `mujoco_rays_per_s` (medians), their `ratio`, the largest difference
-        between ranges `max_error_m`, and `mismatches`, rays that met something in one only.
-    """
-    world = random_obstacles(seed, num_obstacles)
-    spec = LidarSpec(rings, azimuths)
-    params = LidarParams(max_range=100.0)
-    pose = np.asarray([0.1, -0.2, np.random.default_rng(seed).uniform(-np.pi, np.pi)], np.float32)
-    native = native_lidar(spec, params, world, pose)
-    on_device = jax.tree.map(jnp.asarray, (params, world, pose))
-
-    def ours() -> jax.Array:
-        return cast(spec, *on_device)
-
-    seconds, native_seconds = _interleaved([ours, native], repeats)
-    ranges, expected = np.asarray(ours(), float), native()
-    both = np.isfinite(ranges) & np.isfinite(expected)
-    return {
-        "rays_per_s": spec.num_points / seconds,
-        "mujoco_rays_per_s": spec.num_points / native_seconds,
-        "ratio": native_seconds / seconds,
-        "max_error_m": float(np.max(np.abs(ranges[both] - expected[both]), initial=0.0)),
-        "mismatches": float(np.sum(np.isfinite(ranges) != np.isfinite(expected))),
-    }
 
 
 class Drive(NamedTuple):
@@ -280,7 +153,7 @@ def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[st
     square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
     matmul = jax.jit(lambda a: a @ a)
     calls = [functools.partial(score, words, chosen) for chosen in sets.values()]
-    *seconds, reference = _interleaved([*calls, lambda: matmul(square)], repeats)
+    *seconds, reference = interleaved([*calls, lambda: matmul(square)], repeats)
     rates = {str(n): n * NUM_STEPS / s for n, s in zip(sets, seconds, strict=True)}
     return rates, _difference(pairs), 1e3 * reference
 
@@ -363,22 +236,27 @@ def run(*, quick: bool = False) -> dict[str, Any]:
 
     Returns:
         `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `lidar`,
-        `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
+        `camera`, `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
     drive = record(2 * STRIDE if quick else warm_up + 200)
     rates, error, reference = scoring_times(drive, 3 if quick else 50)
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)
+    camera = camera_against_mujoco(repeats=3 if quick else 20)
     per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
     return {
         "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error, "lidar": lidar,
-        "episodes_per_s": per_second, "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
+        "camera": camera, "episodes_per_s": per_second, "episodes": episodes, "reference_matmul_ms": reference,
+        "machine": machine(),
     }  # fmt: skip
 
 
 def table(result: dict[str, Any]) -> str:
     """The result of `run` for people."""
-    tick, error, lidar, episodes = (result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "episodes"))
+    tick, error, lidar, camera, episodes = (
+        result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "camera", "episodes")
+    )
+    rival = camera["no_mujoco"] or f"{camera['ratio']:.1f} x MuJoCo"
     rates = {f"scoring, {int(n):,} x {NUM_STEPS}": rate for n, rate in result["scoring"].items()}
     rows = [
         ("tick, 4,096 candidates", f"{tick['median']:.1f} ms median, {tick['p95']:.1f} p95, {tick['max']:.1f} max"),
@@ -391,6 +269,7 @@ def table(result: dict[str, Any]) -> str:
         ),
         ("LiDAR 16x360, 100 obstacles", f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo"),
         ("  against MuJoCo", f"max error {lidar['max_error_m']:.1e} m"),
+        ("camera 96x96, 100 obstacles", f"{camera['images_per_s']:.0f} images/s, {rival}"),
         ("episodes of 600 steps", f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call)"),
         ("matmul 1024^3 float32", f"{result['reference_matmul_ms']:.1f} ms"),
         ("machine", "{cores} x {cpu}, {device}, jax {jax}, python {python}".format(**result["machine"])),

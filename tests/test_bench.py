@@ -16,12 +16,13 @@ def result():
 
 def test_every_figure_is_there(result):
     assert set(result) == {
-        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "episodes_per_s", "episodes", "reference_matmul_ms",
+        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "camera", "episodes_per_s", "episodes", "reference_matmul_ms",
         "machine",
     }  # fmt: skip
     assert {"median", "p95", "max", "replan_p95"} <= set(result["tick_lidar_ms"])
     assert set(result["scoring"]) == {"4096", "65536"}
     assert {"rays_per_s", "mujoco_rays_per_s", "ratio", "max_error_m"} <= set(result["lidar"])
+    assert set(result["camera"]) == {"images_per_s", "mujoco_images_per_s", "ratio", "no_mujoco", "matmul_ms"}
     assert {"cores", "cpu", "jax", "platform", "python"} <= set(result["machine"])
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
@@ -32,6 +33,12 @@ def test_figures_fit_together(result):
     assert min(*result["scoring"].values(), result["episodes_per_s"], result["reference_matmul_ms"]) > 0
     lidar = result["lidar"]
     assert lidar["ratio"] == pytest.approx(lidar["rays_per_s"] / lidar["mujoco_rays_per_s"])
+    camera = result["camera"]
+    assert min(camera["images_per_s"], camera["matmul_ms"]) > 0
+    if camera["no_mujoco"] is None:
+        assert camera["ratio"] == pytest.approx(camera["images_per_s"] / camera["mujoco_images_per_s"])
+    else:
+        assert "libegl1" in camera["no_mujoco"] and camera["ratio"] is camera["mujoco_images_per_s"] is None
     assert lidar["max_error_m"] < 1e-3 and lidar["mismatches"] == 0
 
 
@@ -56,6 +63,6 @@ def test_difference_is_that_of_the_scores():
 
 def test_table_names_every_part(result):
     text = bench.table(result)
-    for part in ("tick, 4,096", "tick that replans", "65,536 x 56", "LiDAR", "episodes", "matmul"):
+    for part in ("tick, 4,096", "tick that replans", "65,536 x 56", "LiDAR", "camera 96x96", "episodes", "matmul"):
         assert part in text
     assert result["machine"]["cpu"] in text

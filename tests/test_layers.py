@@ -24,6 +24,7 @@ RANKS = {
     "dataset": 3,
     "train": 3,
     "bench": 3,
+    "bench_sensors": 3,
     "report": 3,
     "sources": 3,
     "navigator": 2,
@@ -39,7 +40,7 @@ RANKS = {
     "geometry": 0,
     "grids": 0,
 }
-SIDEWAYS = {("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate")}
+SIDEWAYS = {("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors")}
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400
 # Heavy or talkative, and needed by one subpackage each, which imports them when it is used.

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drnav_jax import bench, sim
+from drnav_jax import bench_sensors as bench
+from drnav_jax import sim
 from drnav_jax.sim.lidar import HIT_MARGIN
 from drnav_jax.worlds.world import World, from_grid, make_world, stack_worlds
 
