@@ -10,6 +10,13 @@ footprint, the same for all rings) and one per ring (its height, the same for al
 ray meets it where the two overlap. A grid map has one wall distance per azimuth (`field.py`): a
 ray meets that wall, passes over it, or reaches the ground before it.
 
+Of a solid's material (`worlds.materials`) counts its extinction k: a beam comes out of it, after a way l in it, with
+
+    P = exp(-k l)                                                                             (2)
+
+So it ends at opaque solids (k = inf), passes glass (k = 0), and returns from plants at a random depth or passes them too.
+Over a drop there is no ground: the beam goes on to the drop's floor or far wall. Paint and floors are the ground.
+
 A scan is ring-major: point `i * azimuths + j` is of ring i (0 = lowest) at the azimuth
 -pi + (j + 1/2) 2 pi / azimuths.
 """
@@ -26,7 +33,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from drnav_jax.grids import once
 from drnav_jax.sim.field import wall_distance
+from drnav_jax.sim.spans import DROPS, OPAQUE, VEILS, Spans, box_spans, cylinder_spans, down_drops, each
 from drnav_jax.types import Scalar
+from drnav_jax.worlds.materials import EXTINCTION
 from drnav_jax.worlds.world import WALL_HEIGHT, World
 
 HIT_MARGIN = 0.01  # [m] a return reads at most max_range less this: a beam at max_range met nothing
@@ -87,59 +96,13 @@ class LidarParams(NamedTuple):
     dropout: Scalar = 0.01  # [] probability that a beam gives no reading
 
 
-class _Spans(NamedTuple):
-    """Where rays enter and leave upright obstacles, in horizontal distance; inf = never."""
-
-    entry: Array  # [N, A] through the side
-    leave: Array  # [N, A]
-    within: Array  # [N] whether the sensor is in the footprint
-    low: Array  # [N] bottom, relative to the sensor
-    high: Array  # [N] top
-
-
-def _box_spans(boxes: Array, height: Array, pose: Array, dx: Array, dy: Array) -> _Spans:
-    c, s = jnp.cos(boxes[:, 2]), jnp.sin(boxes[:, 2])
-    rx, ry = pose[0] - boxes[:, 0], pose[1] - boxes[:, 1]
-    entry, leave, within = [], [], []
-    for axis_x, axis_y, half in ((c, s, boxes[:, 3]), (-s, c, boxes[:, 4])):
-        at = axis_x * rx + axis_y * ry
-        along = axis_x[:, None] * dx[None] + axis_y[:, None] * dy[None]
-        inverse = 1 / jnp.where(jnp.abs(along) < 1e-9, 1e-9, along)
-        a, b = (-half - at)[:, None] * inverse, (half - at)[:, None] * inverse
-        entry.append(jnp.minimum(a, b))
-        leave.append(jnp.maximum(a, b))
-        within.append(jnp.abs(at) < half)
-    return _Spans(
-        entry=jnp.maximum(*entry),
-        leave=jnp.minimum(*leave),
-        within=within[0] & within[1],
-        low=boxes[:, 5] - height,
-        high=boxes[:, 6] - height,
-    )
-
-
-def _cylinder_spans(cylinders: Array, height: Array, pose: Array, dx: Array, dy: Array) -> _Spans:
-    rx, ry, r = cylinders[:, 0] - pose[0], cylinders[:, 1] - pose[1], cylinders[:, 2]
-    along = rx[:, None] * dx[None] + ry[:, None] * dy[None]
-    aside = jnp.abs(rx[:, None] * dy[None] - ry[:, None] * dx[None])
-    # (r - a)(r + a) and not r^2 - a^2: a ray that just touches keeps its digits.
-    half = jnp.sqrt(jnp.maximum((r[:, None] - aside) * (r[:, None] + aside), 0.0))
-    return _Spans(
-        entry=along - half,
-        leave=along + half,
-        within=rx * rx + ry * ry < r * r,
-        low=cylinders[:, 3] - height,
-        high=cylinders[:, 4] - height,
-    )
-
-
-def _meet(spans: _Spans, slope: Array) -> Array:
-    """Horizontal distance `[rings, A]` to the first obstacle on rays of these slopes; inf = none."""
+def _opaque(spans: Spans, opaque: Array, slope: Array, reach: Array) -> Array:
+    """Horizontal distance `[rings, A]` to the first opaque solid on rays of these slopes; inf = none."""
     a, b = spans.low[:, None] / slope[None], spans.high[:, None] / slope[None]
     above, below = jnp.minimum(a, b), jnp.maximum(a, b)
     # Inside an obstacle the ray meets its far side. The nearest of several needs no pairs: it is
     # the nearest exit through a side (per azimuth) or through a top or bottom (per ring).
-    within = (spans.within & (spans.low < 0) & (spans.high > 0))[:, None]
+    within = (opaque & spans.within & (spans.low < 0) & (spans.high > 0))[:, None]
     sides = jnp.min(jnp.where(within, spans.leave, jnp.inf), axis=0)
     caps = jnp.min(jnp.where(within, below, jnp.inf), axis=0)
     # What lies behind the sensor, in either sense, is taken out: then an overlap is a hit ahead.
@@ -151,16 +114,89 @@ def _meet(spans: _Spans, slope: Array) -> Array:
         last = jnp.minimum(spans.leave[n][None, :], below[n][:, None])
         return jnp.minimum(met, jnp.where(first < last, first, jnp.inf))
 
-    # One obstacle at a time, all rays at once: the ranges stay in the first-level cache.
     met = jnp.minimum(sides[None, :], caps[:, None])
-    return jnp.maximum(jax.lax.fori_loop(0, entry.shape[0], nearer, met), 0.0)
+    ahead = opaque & jnp.any((entry < spans.leave) & (entry <= reach), axis=1)
+    return jnp.maximum(each(ahead, nearer, met), 0.0)
 
 
-@functools.partial(jax.jit, static_argnames="spec")
+def _veiled(
+    spans: Spans, veils: Array, extinction: Array, slope: Array, cos: Array, met: Array, word: Array | None
+) -> Array:
+    """`met` `[rings, A]`, or less where a beam returns from a veil before it.
+
+    With `word` (random, `[rings, A]`) a beam runs an exponential length into each plant, of its own: so the first of
+    all returns is distributed as eq. 2 says, whatever plants overlap. Without, it returns from every veil's surface.
+    """
+
+    def nearer(n: Array, met: Array) -> Array:
+        a, b = spans.low[n] / slope, spans.high[n] / slope
+        first = jnp.maximum(spans.entry[n][None, :], jnp.minimum(a, b)[:, None])
+        last = jnp.minimum(spans.leave[n][None, :], jnp.maximum(a, b)[:, None])
+        at = first = jnp.maximum(first, 0.0)
+        if word is not None:
+            length = -jnp.log(_uniform(word, n)) / jnp.maximum(extinction[n], 1e-9)
+            at = first + length * cos[:, None]
+        return jnp.where((at < last) & (first < last), jnp.minimum(met, at), met)
+
+    return each(veils & jnp.any(spans.entry < spans.leave, axis=1), nearer, met)
+
+
+def _uniform(word: Array, n: Array) -> Array:
+    """A number in (0, 1) for each random word and a solid's index: the word's bits, mixed anew for each index."""
+    bits = word ^ ((n.astype(jnp.uint32) + 1) * jnp.uint32(0x9E3779B9))
+    bits = (bits ^ (bits >> 16)) * jnp.uint32(0x85EBCA6B)
+    bits = (bits ^ (bits >> 13)) * jnp.uint32(0xC2B2AE35)
+    bits = bits ^ (bits >> 16)
+    return ((bits >> 9).astype(jnp.float32) + 0.5) * 2.0**-23
+
+
+def _trace(
+    spec: LidarSpec, params: LidarParams, world: World, pose: Array, *, veils: bool, word: Array | None = None
+) -> Array:
+    """Ranges `[rings, azimuths]` as `cast`; with `word` plants return beams at random."""
+    scenery, height = world.scenery, _f32(params.height)
+    slope, cos = np.tan(spec.elevations), np.cos(spec.elevations)
+    slope, cos = _f32(np.where(np.abs(slope) < 1e-9, 1e-9, slope)), _f32(cos)
+    reach, shape = _f32(params.max_range) * cos, (spec.rings, spec.azimuths)
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    along_x, along_y = _f32(np.cos(spec.bearings)), _f32(np.sin(spec.bearings))
+    dx, dy = c * along_x - s * along_y, s * along_x + c * along_y
+
+    ground = jnp.where(slope < 0, -height / slope, jnp.inf)[:, None]
+    ceiling = jnp.where(slope > 0, (_f32(scenery.ceiling) - height) / slope, jnp.inf)[:, None]
+    rows, looks = (world.boxes, world.cylinders), (world.box_surfaces, world.cylinder_surfaces)
+    spans_of = (box_spans, cylinder_spans)
+    kinds = [(_f32(r), a.material, of) for r, a, of in zip(rows, looks, spans_of, strict=True) if len(r)]
+    if not kinds:
+        met = jnp.minimum(ground, ceiling)
+    else:
+        spans = jax.tree.map(lambda *parts: jnp.concatenate(parts), *(of(r, height, pose, dx, dy) for r, _, of in kinds))
+        material = jnp.concatenate([jnp.asarray(m, jnp.int32) for _, m, _ in kinds])
+        opaque, veiling, drops = (jnp.asarray(kind)[material] for kind in (OPAQUE, VEILS, DROPS))
+
+        def floor(n: Array) -> Array:
+            return jnp.maximum(spans.low[n] / slope, spans.high[n] / slope)[:, None]
+
+        def footprint(n: Array) -> tuple[Array, Array]:
+            return spans.entry[n][None, :], spans.leave[n][None, :]
+
+        end, _ = down_drops(jnp.broadcast_to(ground, shape), drops, footprint, floor)
+        met = jnp.minimum(jnp.minimum(end, ceiling), _opaque(spans, opaque, slope, jnp.max(reach)))
+        if veils:
+            met = _veiled(spans, veiling, jnp.asarray(EXTINCTION)[material], slope, cos, met, word)
+    if world.field.values.size:
+        wall = wall_distance(jax.tree.map(_f32, world.field), pose[:2], dx, dy, jnp.max(reach))[None, :]
+        over = height + wall * slope[:, None] > WALL_HEIGHT
+        met = jnp.minimum(met, jnp.where(over, jnp.inf, wall))
+    met = jnp.broadcast_to(met, shape)
+    return jnp.where(met <= reach[:, None], met / cos[:, None], jnp.inf)
+
+
+@functools.partial(jax.jit, static_argnames=("spec", "veils"))
 def cast(
-    spec: LidarSpec, params: LidarParams, world: World, pose: Float[Array, "3"]
+    spec: LidarSpec, params: LidarParams, world: World, pose: Float[Array, "3"], *, veils: bool = False
 ) -> Float[Array, "rings azimuths"]:
-    """Exact ranges to the first surface (obstacle, wall or ground), without noise.
+    """Exact ranges to the first opaque surface (obstacle, wall, ceiling, ground or what is below a drop), without noise.
 
     A sensor inside an obstacle sees the obstacle's far side, as in MuJoCo.
 
@@ -169,42 +205,23 @@ def cast(
         params: Range and mounting height.
         world: What can be met, besides the ground at z = 0.
         pose: x, y, yaw of `base_link` in the world's frame [m, rad].
+        veils: Whether panes and plants count as if they were opaque; otherwise the rays pass them.
 
     Returns:
         Ranges [m], `[rings, azimuths]`; inf where nothing is met within `max_range`.
     """
-    world, height = jax.tree.map(_f32, world), _f32(params.height)
-    slope, cos = np.tan(spec.elevations), np.cos(spec.elevations)
-    slope, cos = _f32(np.where(np.abs(slope) < 1e-9, 1e-9, slope)), _f32(cos)
-    reach = _f32(params.max_range) * cos
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    along_x, along_y = _f32(np.cos(spec.bearings)), _f32(np.sin(spec.bearings))
-    dx, dy = c * along_x - s * along_y, s * along_x + c * along_y
-
-    met = jnp.where(slope < 0, -height / slope, jnp.inf)[:, None]
-    kinds = ((world.boxes, _box_spans), (world.cylinders, _cylinder_spans))
-    spans = [of(rows, height, pose, dx, dy) for rows, of in kinds if rows.shape[0]]
-    if spans:
-        every = jax.tree.map(lambda *parts: jnp.concatenate(parts), *spans)
-        met = jnp.minimum(met, _meet(every, slope))
-    if world.field.values.size:
-        wall = wall_distance(world.field, pose[:2], dx, dy, jnp.max(reach))[None, :]
-        over = height + wall * slope[:, None] > WALL_HEIGHT
-        met = jnp.minimum(met, jnp.where(over, jnp.inf, wall))
-    met = jnp.broadcast_to(met, (spec.rings, spec.azimuths))
-    return jnp.where(met <= reach[:, None], met / cos[:, None], jnp.inf)
+    return _trace(spec, params, world, pose, veils=veils)
 
 
-def _noise(key: PRNGKeyArray, shape: tuple[int, int]) -> tuple[Array, Array]:
+def _noise(word: Array) -> tuple[Array, Array]:
     """Standard normal and uniform numbers, made of the two halves of one random word each.
 
     The normal goes to 4.2 standard deviations and the uniform has steps of 1.5e-5, which is
     enough for a sensor and half the price of drawing both in full.
     """
-    bits = jax.random.bits(key, shape, jnp.uint32)
-    half = (bits >> 16).astype(jnp.float32)
+    half = (word >> 16).astype(jnp.float32)
     normal = math.sqrt(2.0) * jax.scipy.special.erfinv((half + 0.5) * 2.0**-15 - 1.0)
-    return normal, (bits & 0xFFFF).astype(jnp.float32) * 2.0**-16
+    return normal, (word & 0xFFFF).astype(jnp.float32) * 2.0**-16
 
 
 @functools.partial(jax.jit, static_argnames="spec")
@@ -217,9 +234,9 @@ def scan(
 ) -> tuple[Float[Array, "points 3"], Bool[Array, " points"]]:
     """One turn of the LiDAR, as a sensor reports it.
 
-    Ranges have Gaussian noise. A beam that meets nothing is a valid point at `max_range` from the
-    sensor (to rounding); a return reads at most `max_range - HIT_MARGIN`. A beam that drops out is
-    invalid, its point lies at the sensor.
+    Beams pass glass, and return from plants at random depths (eq. 2). Ranges have Gaussian noise. A beam that meets
+    nothing is a valid point at `max_range` from the sensor (to rounding); a return reads at most `max_range -
+    HIT_MARGIN`. A beam that drops out is invalid, its point lies at the sensor.
 
     Args:
         spec: The beams.
@@ -232,9 +249,10 @@ def scan(
         Points in `base_link`, z up from the ground [m], `[rings * azimuths, 3]`, ring-major; and
         which of them are valid.
     """
-    ranges = cast(spec, params, world, pose)
+    word = jax.random.bits(key, (spec.rings, spec.azimuths), jnp.uint32)
+    ranges = _trace(spec, params, world, pose, veils=True, word=word)
     max_range = _f32(params.max_range)
-    normal, uniform = _noise(key, (spec.rings, spec.azimuths))
+    normal, uniform = _noise(word)
     measured = ranges + _f32(params.noise_std) * normal
     measured = jnp.clip(measured, 0.0, max_range - HIT_MARGIN)
     measured = jnp.where(jnp.isinf(ranges), max_range, measured)

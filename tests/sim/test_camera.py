@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_rays import MARCH, trace
 
 from drnav_jax import bench_sensors, sim
 from drnav_jax.sim.sight import NEAR
@@ -16,7 +17,6 @@ from drnav_jax.worlds.world import FAR, WALL_HEIGHT, Scenery, from_grid, make_wo
 
 TILTED = (Mount(pitch=0.35), Mount(yaw=2.0, pitch=0.3, roll=0.2), Mount(yaw=-1.5, pitch=-0.25, roll=-0.5, z=1.2))
 ROUNDING = 2e-4  # [] of a depth in float32: the ray, the hit and the difference of two of them
-MARCH = 2e-3  # [m] step of the oracle down a drop
 ORIGIN = np.zeros(3, np.float32)
 NUM = 12  # boxes of a test's world, so that all are one program
 SMALL = RigSpec((Mount(),), shape=(24, 32))
@@ -90,66 +90,6 @@ def rays_of(spec, pose):
         yield np.array([pose[0] + c * m.x - s * m.y, pose[1] + s * m.x + c * m.y, m.z]), local
 
 
-def inside_footprint(row, x, y):
-    ax, ay = x - row[0], y - row[1]
-    along, across = math.cos(row[2]) * ax + math.sin(row[2]) * ay, math.cos(row[2]) * ay - math.sin(row[2]) * ax
-    return abs(along) <= row[3] and abs(across) <= row[4]
-
-
-def box_hit(row, p, d):
-    """(enter, leave) of one ray, or None."""
-    c, s = math.cos(row[2]), math.sin(row[2])
-    ax, ay = p[0] - row[0], p[1] - row[1]
-    at = [c * ax + s * ay, c * ay - s * ax, p[2] - (row[5] + row[6]) / 2]
-    way = [c * d[0] + s * d[1], c * d[1] - s * d[0], d[2]]
-    enter, leave = -math.inf, math.inf
-    for a, v, half in zip(at, way, (row[3], row[4], (row[6] - row[5]) / 2), strict=True):
-        if abs(v) < 1e-12:
-            if abs(a) > half:
-                return None
-            continue
-        enter, leave = max(enter, min((-half - a) / v, (half - a) / v)), min(leave, max((-half - a) / v, (half - a) / v))
-    return (enter, leave) if enter < leave and leave > 0 else None
-
-
-def post_hit(row, p, d):
-    a = d[0] ** 2 + d[1] ** 2
-    b = d[0] * (p[0] - row[0]) + d[1] * (p[1] - row[1])
-    under = b * b - a * ((p[0] - row[0]) ** 2 + (p[1] - row[1]) ** 2 - row[2] ** 2)
-    if under <= 0:
-        return None
-    heights = sorted(((row[3] - p[2]) / d[2], (row[4] - p[2]) / d[2]))
-    enter, leave = max((-b - under**0.5) / a, heights[0]), min((-b + under**0.5) / a, heights[1])
-    return (enter, leave) if enter < leave and leave > 0 else None
-
-
-def oracle(world, p, d, veils):
-    """Depth of one ray in a world of boxes and cylinders."""
-    found = [math.inf]
-    drops = []
-    for rows, looks, hit in (
-        (world.boxes, world.box_surfaces, box_hit), (world.cylinders, world.cylinder_surfaces, post_hit)
-    ):  # fmt: skip
-        for row, material in zip(np.asarray(rows, float), np.asarray(looks.material), strict=True):
-            if material == Material.DROP:
-                drops.append(row)
-            see_through = material in (Material.GLASS, Material.BUSH, Material.GRASS)
-            if material in (Material.DROP, Material.STRIPE) or (see_through and not veils):
-                continue
-            met = hit(row, p, d)
-            if met and see_through and met[1] > max(met[0], NEAR):
-                found.append(max(met[0], NEAR))
-            elif met and not see_through:
-                found.append(met[0] if met[0] >= 0 else met[1])
-    if d[2] > 0:
-        return min(*found, (float(world.scenery.ceiling) - p[2]) / d[2])
-    t = -p[2] / d[2]
-    step = MARCH / np.linalg.norm(d)
-    while any(inside_footprint(r, *(p + t * d)[:2]) and (p + t * d)[2] > r[5] for r in drops):
-        t += step
-    return min(*found, t)
-
-
 MIXED = world_of(
     block(4.0, 1.5, 0.3, 0.8, yaw=0.4), block(3.0, -0.5, 0.02, 0.9, material=Material.GLASS),
     block(2.5, 2.0, 0.5, 0.4, 0.7, Material.BUSH), block(0.5, -2.0, 1.0, 1.0, 0.8, Material.GRASS),
@@ -168,7 +108,7 @@ def test_depth_is_that_of_single_rays(mounts, veils):
     ours, wrong, fell = depth(MIXED, spec, pose, veils=veils), 0, 0
     for camera, (p, rays) in zip(ours, rays_of(spec, pose), strict=True):
         for index in np.ndindex(spec.shape):
-            expected = oracle(MIXED, p, rays[index], veils)
+            expected, _ = trace(MIXED, p, rays[index], veils, NEAR)
             below = (p + expected * rays[index])[2] < -1e-3
             fell += below
             # An edge that passes through a pixel's middle may fall to either side.

@@ -5,11 +5,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference_rays import MARCH, trace
+from scipy import stats
 
 from drnav_jax import bench_sensors as bench
 from drnav_jax import sim
 from drnav_jax.sim.lidar import HIT_MARGIN
-from drnav_jax.worlds.world import World, from_grid, make_world, stack_worlds
+from drnav_jax.worlds.materials import EXTINCTION, Material
+from drnav_jax.worlds.world import Scenery, World, from_grid, make_world, stack_worlds, surfaces
 
 # float32 distances over 30 m, where a ray touches a curved side: measured 2.4e-4 m over 100 worlds.
 MAX_ERROR = 1e-3
@@ -174,6 +177,103 @@ def test_a_beam_that_meets_nothing_is_told_from_a_far_return():
     points, _ = scan(spec, world_of(cylinders=[[0.0, 0.0, 11.99, 0.0, 9.0]]), dropout=0.0)
     ranges = np.linalg.norm(points - [0, 0, 0.5], axis=1)
     assert ranges.max() <= 12.0 - HIT_MARGIN + ROUNDING and ranges.std() > 0
+
+
+def mixed_world(seed: int, ceiling: float = np.inf) -> World:
+    """Boxes and cylinders of all materials around the origin, with drops that touch and plants that overlap."""
+    rng = np.random.default_rng(seed)
+    plants = [Material.BUSH, Material.GRASS, Material.GRASS, Material.BUSH]
+    materials = [*plants, Material.GLASS, Material.BRICK, Material.STRIPE]
+    n, angle = len(materials), rng.uniform(-np.pi, np.pi, len(materials))
+    xy = rng.uniform(1.5, 6.0, (n, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    heights = np.stack([np.zeros(n), rng.uniform(0.3, 1.5, n)], axis=1)
+    boxes = np.concatenate([xy, rng.uniform(-3, 3, (n, 1)), rng.uniform(0.1, 1.2, (n, 2)), heights], axis=1)
+    drops = [[2.0, -0.5, 0.3, 0.6, 0.5, -0.7, 0.0], [2.6, -0.3, 0.3, 0.5, 0.5, -0.4, 0.0], [-2.5, 0, 0, 1, 2, -2.0, 0.0]]
+    posts = [[-1.5, -1.5, 0.5, 0.0, 1.2], [1.0, 2.5, 0.4, 0.2, 0.9]]
+    return make_world(
+        np.concatenate([boxes, drops]), posts, box_surfaces=surfaces(n + 3, [*materials, *[Material.DROP] * 3]),
+        cylinder_surfaces=surfaces(2, [Material.BUSH, Material.CONCRETE]), scenery=Scenery(ceiling=ceiling),
+    )  # fmt: skip
+
+
+STEEP = sim.LidarSpec(rings=10, azimuths=61, elevation_min=-0.7, elevation_max=0.5)
+SENSOR = np.asarray([0.0, 0.0, 0.5])
+
+
+def rays_of(spec: sim.LidarSpec) -> np.ndarray:
+    e, a = np.meshgrid(spec.elevations, spec.bearings, indexing="ij")
+    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("veils", [False, True])
+def test_ranges_among_all_materials_are_those_of_single_rays(seed, veils):
+    world, rays = mixed_world(seed, ceiling=1.8), rays_of(STEEP)
+    on_device, pose = jax.tree.map(jnp.asarray, (world, ORIGIN))
+    ours = np.asarray(sim.cast(STEEP, sim.LidarParams(), on_device, pose, veils=veils))
+    wrong, fell = 0, 0
+    for index in np.ndindex(*ours.shape):
+        expected, _ = trace(world, SENSOR, rays[index], veils)
+        expected = expected if expected < 12.0 else np.inf
+        fell += 0.5 + expected * rays[index][2] < -0.01
+        wrong += not np.isclose(ours[index], expected, rtol=0, atol=MAX_ERROR + MARCH)
+    assert fell > 10
+    assert wrong <= 1  # a ray along an edge may fall to either side
+
+
+def test_plants_return_beams_as_often_and_as_deep_as_their_extinction_says():
+    """400 scans, ray by ray, against exp(-k l) of a loop over single rays."""
+    world, spec, num = mixed_world(1), STEEP, 400
+    on_device, pose = jax.tree.map(jnp.asarray, (world, ORIGIN))
+    params = sim.LidarParams(noise_std=0.0, dropout=0.0)
+    keys = jax.random.split(jax.random.key(0), num)
+    points, valid = jax.lax.map(lambda key: sim.scan(spec, params, on_device, pose, key), keys)
+    ranges = np.linalg.norm(np.asarray(points) - SENSOR, axis=-1).reshape(num, spec.rings, spec.azimuths)
+    exact = np.minimum(np.asarray(sim.cast(spec, params, on_device, pose)), 12.0)
+    assert np.asarray(valid).all()
+    off, depths = [], []
+    for index in np.ndindex(*exact.shape):
+        passed = trace(world, SENSOR, rays_of(spec)[index])[1]
+        expected = 1 - np.exp(-sum(EXTINCTION[m] * (leave - enter) for m, enter, leave in passed))
+        early = ranges[:, *index] < exact[index] - 1e-3
+        if expected == 0:
+            assert not early.any()  # glass, or nothing on the way
+        elif 0.02 < expected < 0.98:
+            off.append((early.mean() - expected) / np.sqrt(expected * (1 - expected) / num))
+        if [m for m, _, _ in passed] == [Material.GRASS] and passed[0][2] - passed[0][1] > 0.3:
+            # How far into the one plant, as the share of all that return: uniform if exponential.
+            k, (_, enter, leave) = EXTINCTION[Material.GRASS], passed[0]
+            depths.append(np.expm1(-k * (ranges[early, *index] - enter)) / np.expm1(-k * (leave - enter)))
+    assert len(off) > 40 and abs(np.mean(off)) < 0.5 and 0.7 < np.std(off) < 1.4 and np.max(np.abs(off)) < 5
+    all_depths = np.concatenate(depths)
+    assert len(all_depths) > 1000 and stats.kstest(all_depths, "uniform").pvalue > 1e-3
+    # Rays next to each other, and scans one after another, are independent.
+    met = ranges < exact[None] - 1e-3
+    often = (met.mean(axis=0) > 0.2) & (met.mean(axis=0) < 0.8)
+    rate = met[:, often] - met[:, often].mean(axis=0)
+    assert abs(np.mean(rate[1:] * rate[:-1])) < 0.01 and abs(np.mean(rate[:, 1:] * rate[:, :-1])) < 0.01
+
+
+def test_beams_pass_glass_and_paint_and_fall_into_a_drop():
+    def seen(material, low, high):
+        world = make_world([[3.0, 0.0, 0.0, 1.0, 9.0, low, high]], box_surfaces=surfaces(1, material))
+        return cast(sim.LidarSpec(rings=2, azimuths=1, elevation_min=-0.2, elevation_max=0.1), world)[:, 0]
+
+    ground = 0.5 / np.sin(0.2)
+    np.testing.assert_allclose(seen(Material.GLASS, 0.0, 2.0), [ground, np.inf], rtol=1e-6)
+    np.testing.assert_allclose(seen(Material.STRIPE, 0.0, 2.0), [ground, np.inf], rtol=1e-6)
+    np.testing.assert_allclose(seen(Material.WALL, 0.0, 2.0), [2 / np.cos(0.2), 2 / np.cos(0.1)], rtol=1e-6)
+    np.testing.assert_allclose(seen(Material.DROP, -0.1, 0.0), [0.6 / np.sin(0.2), np.inf], rtol=1e-6)  # its floor
+    np.testing.assert_allclose(seen(Material.DROP, -1.0, 0.0), [4 / np.cos(0.2), np.inf], rtol=1e-6)  # its far wall
+
+
+def test_a_ceiling_is_met_and_one_ring_or_many_do():
+    low = make_world(scenery=Scenery(ceiling=2.0))
+    for rings in (1, 64):
+        spec = sim.LidarSpec(rings=rings, azimuths=4, elevation_min=0.2, elevation_max=0.3)
+        expected = 1.5 / np.sin(spec.elevations)
+        np.testing.assert_allclose(cast(spec, low), np.repeat(expected[:, None], 4, axis=1), rtol=1e-5)
+        assert scan(spec, low)[0].shape == (4 * rings, 3)
 
 
 def test_vmap_is_a_loop():
