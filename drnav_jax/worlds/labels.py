@@ -17,26 +17,18 @@ start to goal. A part of F without an anchor is closed: there (c) allows one hal
 are relative to the largest piece. Shares count the cells up to W / 2 + R + 3 h off the grid.
 Stated limit: a pillar that leaves two passable gaps in a mouth opens the pocket.
 
-Every cell of M is tried, but no component is grown. Each edge between neighbours in F gets a random
-64-bit word. A spanning tree of F, rooted outside, numbers the cells such that a subtree is an
-interval [lo, hi); the XOR of the words of all edges that leave it is X[hi] ^ X[lo] for one prefix
-array X, and its area S[hi] - S[lo]. Around D runs a ring of cells, which obstacles cut into arcs; what
-an arc hides is a signed sum of the subtrees whose tree edge crosses the rim of D there. What a set of
-arcs hides is cut off iff no edge leaves it but those into D, that is, but for odds of 2**-64, iff
-
-    (6)  XOR over the arcs of (words leaving the subtrees cut there ^ words of edges into D) = 0.
-
-A gate thus costs a walk around its rim, and elimination over GF(2) tells which arcs belong together.
+How the pieces P are found without growing any: `cuts`.
 """
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt64
+from jaxtyping import Bool, Float, Float32, Int, Int32
 from scipy import ndimage, spatial
 from scipy.sparse import csgraph, csr_array
+
+from drnav_jax.worlds.cuts import grow, pieces, spans
 
 _CROSS = ndimage.generate_binary_structure(2, 1)
 _BOX = ndimage.generate_binary_structure(2, 2)
@@ -66,12 +58,14 @@ class LabelSpec:
 
 
 class DeadEndLabels(NamedTuple):
-    """Labels of one map, on its grid; cells that are not in F belong to no pocket."""
+    """Labels of one map, on its grid, and of its P pockets; cells that are not in F belong to none."""
 
     label: Bool[np.ndarray, "H W"]  # True = dead end
     depth: Float32[np.ndarray, "H W"]  # [m] beyond the mouth: way in F to a cell without label
     gap: Float32[np.ndarray, "H W"]  # [m] of the narrowest gate that cuts the cell off, else inf
     pocket: Int32[np.ndarray, "H W"]  # id, from 1, of the outermost pocket; 0 = none
+    mouth: Int32[np.ndarray, "P 2"]  # (row, column) of each pocket's gate; may lie off the grid
+    mouth_gap: Float32[np.ndarray, " P"]  # [m] its gap. Of all gates it cuts off the largest area
 
 
 def dead_ends(
@@ -123,16 +117,24 @@ def dead_ends(
         gates, squares = gates[apart], squares[apart]
     counted = np.zeros(free.shape, bool)
     counted[pad - rim : rim - pad, pad - rim : rim - pad] = True
-    gap = _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec)
+    gap, cuts = _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec)
     label = np.isfinite(gap)
     inside = (slice(pad, -pad), slice(pad, -pad))
-    pocket = _label(label)[inside]
-    number = np.cumsum(np.bincount(pocket[pocket > 0], minlength=2) > 0)  # some lie outside
+    component = _label(label)
+    pocket = component[inside]
+    met = np.bincount(pocket.ravel(), minlength=component.max() + 1)[1:] > 0
+    number = np.append(0, np.where(met, np.cumsum(met), 0))  # some lie outside
+    mouth = np.zeros(number.max() + 1, int)  # gate of each; a later one of the same area is narrower
+    for gate, cell in cuts[np.argsort(cuts[:, 0], kind="stable"), 1:].tolist():
+        mouth[number[component.flat[cell]]] = gate
+    mouth = mouth[1:]
     return DeadEndLabels(
         label=label[inside],
         depth=(_way_out(free, label) * resolution)[inside].astype(np.float32),
         gap=gap[inside].astype(np.float32),
-        pocket=np.where(pocket > 0, number[pocket], 0).astype(np.int32),
+        pocket=number[pocket].astype(np.int32),
+        mouth=(gates[mouth] - pad).astype(np.int32),
+        mouth_gap=(2 * (reach[tuple(gates[mouth].T)] + spec.radius)).astype(np.float32),
     )
 
 
@@ -185,90 +187,11 @@ def _thinned(gates, shape, step):
     return gates[kept]
 
 
-class _Tree(NamedTuple):
-    """Spanning tree of F below one root outside, by flat cell or by position in preorder."""
-
-    part: Int[np.ndarray, " C"]  # which connected part of F, 0 = not in F
-    parent: Int[np.ndarray, " C"]  # flat cell, -1 below the root
-    lo: Int[np.ndarray, " C"]  # position of the cell
-    hi: Int[np.ndarray, " C"]  # end of the positions of its subtree
-    cell: Int[np.ndarray, " N"]  # flat cell at a position; 0, which is not in F, for the root
-    word: UInt64[np.ndarray, " 2C"]  # of the edges to the next column, then of those to the next row
-    leaving: UInt64[np.ndarray, " M"]  # X, M = N + 1
-    area: Int[np.ndarray, " M"]  # S
-
-
-def _grow(part, width, roots, counted, rng):
-    """Spanning tree of F, breadth first from all roots (flat cells) at once."""
-    free = part > 0
-    cells = np.flatnonzero(free)
-    node = np.cumsum(free) - 1  # the root is node N - 1
-    near = cells[:, None] + np.array([1, width, -1, -width])
-    linked = free[near]
-    ends = np.concatenate([[0], np.cumsum(linked.sum(axis=1)), [linked.sum() + len(roots)]])
-    links = node[np.concatenate([near[linked], roots])].astype(np.int32)
-    graph = csr_array((np.ones(len(links)), links, ends), shape=(len(cells) + 1, len(cells) + 1))
-    order, above = csgraph.breadth_first_order(graph, len(cells))
-    count = len(order)
-    rank = np.empty(count, int)
-    rank[order] = np.arange(count)
-    above = np.append(-1, rank[above[order[1:]]])  # never falls: siblings are neighbours in order
-    child = np.searchsorted(above, np.arange(count + 1))  # each one's first
-    levels = [0, 1]
-    while levels[-1] < count:
-        levels.append(int(child[levels[-1]]))
-    size = np.ones(count, int)
-    for a, b, c in reversed(list(zip(levels, levels[1:], levels[2:], strict=False))):
-        below = np.append(0, np.cumsum(size[b:c]))
-        size[a:b] += below[child[a + 1 : b + 1] - b] - below[child[a:b] - b]
-    below = np.append(0, np.cumsum(size))
-    lo = 1 + below[:-1] - below[child[above]]  # behind the parent by this: itself, elder siblings
-    lo[0] = 0
-    for b, c in zip(levels[1:], levels[2:], strict=False):
-        lo[b:c] += lo[above[b:c]]
-    flat = np.append(cells, 0)[order]
-    cell = np.empty(count, int)
-    cell[lo] = flat
-    at = np.full((3, len(part)), -1)
-    at[:, flat[1:]] = np.where(above > 0, flat[above], -1)[1:], lo[1:], (lo + size)[1:]
-    word = rng.integers(0, 2**64, (2, len(part)), np.uint64)
-    for plane, step in enumerate((1, width)):
-        word[plane, ~(free & np.roll(free, -step))] = 0
-    touching = word[0] ^ np.roll(word[0], 1) ^ word[1] ^ np.roll(word[1], width)
-    leaving = np.append(np.uint64(0), np.bitwise_xor.accumulate(touching[cell]))
-    area = np.append(0, np.cumsum(counted[cell]))
-    return _Tree(part, *at, cell=cell, word=word.ravel(), leaving=leaving, area=area)
-
-
-class _Rim(NamedTuple):
-    """Offsets, in a flat grid, around a gate disc."""
-
-    ring: Int[np.ndarray, " B"]  # closed curve of cells just outside, each 4-adjacent to the next
-    at: Int[np.ndarray, " E"]  # edges across the rim: index in the ring of the cell outside,
-    inner: Int[np.ndarray, " E"]  # .. the cell inside,
-    edge: Int[np.ndarray, " E"]  # .. and the edge's own index
-
-
-@functools.lru_cache(maxsize=4096)
-def _rim(squares: int, shape: tuple[int, int]) -> _Rim:
-    """The rim of the disc y^2 + x^2 <= squares."""
-    k = int(np.sqrt(squares)) + 2
-    y, x = np.mgrid[-k : k + 1, -k : k + 1]
-    flat = y * shape[1] + x
-    disc = y**2 + x**2 <= squares
-    ring = ndimage.binary_dilation(disc, _BOX) & ~disc
-    cells = np.argwhere(ring)[np.argsort(np.arctan2(y[ring], x[ring]))]
-    edges = []
-    for step in _STRAIGHT:
-        (at,) = np.nonzero(disc[tuple((cells + step).T)])
-        outer, inner = flat[tuple(cells[at].T)], flat[tuple((cells[at] + step).T)]
-        plane = abs(step[0]) * shape[0] * shape[1]
-        edges.append((at, inner, plane + np.minimum(inner, outer)))
-    return _Rim(flat[tuple(cells.T)], *np.concatenate(edges, axis=1))
-
-
 def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
-    """Gap [m] of the narrowest gate that cuts each cell off, inf where none does (eq. 5)."""
+    """Gap [m] of the narrowest gate that cuts each cell off, inf where none does (eq. 5), and all cuts.
+
+    A cut is (area, number of the gate, flat cell of a cell that is cut off).
+    """
     part = _label(free)
     part_area = np.bincount(part[counted], minlength=part.max() + 1)
     closed = np.ones(len(part_area), bool)
@@ -277,12 +200,12 @@ def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
     root[part.ravel()] = np.arange(part.size)  # any cell of each part
     roots = np.append(np.unique(anchors @ (free.shape[1], 1)), root[closed])
     rng = np.random.default_rng(0)
-    tree = _grow(part.ravel(), free.shape[1], roots, counted.ravel(), rng)
+    tree = grow(part.ravel(), free.shape[1], roots, counted.ravel(), rng)
     # A disc that leaves a single arc leaves all of a part but itself: too much, unless this small.
     small = (closed & (part_area <= 8 * squares.max(initial=0) + 8))[part.ravel()]
     row, column = np.divmod(tree.cell, free.shape[1])
-    gap = np.full(len(tree.cell), np.inf)
-    for k, here, area, lo, hi, sign in _pieces(tree, free.shape, small, gates, squares, rng):
+    gap, cuts = np.full(len(tree.cell), np.inf), []
+    for k, here, area, lo, hi, sign in pieces(tree, free.shape, small, gates, squares, rng):
         if area <= 0 and closed[here]:  # it holds its part's root, so the sum was minus the rest
             area += part_area[here]
             lo, hi = np.append(lo, tree.lo[root[here]]), np.append(hi, tree.hi[root[here]])
@@ -293,89 +216,17 @@ def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
         (i, j), rho = gates[k], reach[tuple(gates[k])]
         width = 2 * (rho + spec.radius)
         need = max(2 * spec.radius + 0.5, spec.depth_ratio * width)
-        spans = _spans(lo, hi, sign)
+        runs = spans(lo, hi, sign)
         if area <= np.pi * ((need + rho) / resolution + 1) ** 2:  # else some must lie far enough
-            square = max(((row[s] - i) ** 2 + (column[s] - j) ** 2).max() for s in spans)
+            square = max(((row[s] - i) ** 2 + (column[s] - j) ** 2).max() for s in runs)
             if np.sqrt(square) * resolution - rho < need:
                 continue
-        for s in spans:
+        for s in runs:
             gap[s] = width
+        cuts.append((area, k, tree.cell[runs[0].start]))
     out = np.full(free.size, np.inf)
     out[tree.cell] = gap
-    return out.reshape(free.shape)
-
-
-def _pieces(tree, shape, small, gates, squares, rng):
-    """Yields (gate, part, area, lo, hi, sign) of each piece of F at each gate's disc.
-
-    The signed intervals of positions add up to the piece; where it holds its part's root, to minus
-    what it does not hold, so that the area is <= 0.
-    """
-    gates = gates @ (shape[1], 1)
-    ties = rng.integers(0, 2**64, 8 * int(np.sqrt(squares.max(initial=0))) + 8, np.uint64)
-    for value in np.unique(squares)[::-1]:
-        group = np.flatnonzero(squares == value)
-        rim = _rim(int(value), shape)
-        ring = gates[group, None] + rim.ring
-        is_free = tree.part[ring] > 0
-        begins = is_free & ~np.roll(is_free, 1, axis=1)
-        num_arcs = begins.sum(axis=1)
-        arcs = (np.cumsum(begins, axis=1) - 1) % np.maximum(num_arcs, 1)[:, None]
-        for k in np.flatnonzero((num_arcs > 1) | small[ring].any(axis=1)):
-            gate = gates[group[k]]
-            linked = is_free[k, rim.at] & (tree.part[gate + rim.inner] > 0)
-            inner, outer = gate + rim.inner[linked], ring[k, rim.at[linked]]
-            if not len(inner):
-                continue
-            arc = arcs[k, rim.at[linked]]
-            down = tree.parent[outer] == inner
-            cut = down | (tree.parent[inner] == outer)
-            top = np.where(down, outer, inner)[cut]
-            lo, hi, sign, behind = tree.lo[top], tree.hi[top], np.where(down, 1, -1)[cut], arc[cut]
-            area = sign * (tree.area[hi] - tree.area[lo])
-            word = tree.word[gate + rim.edge[linked]]
-            word[cut] ^= tree.leaving[hi] ^ tree.leaving[lo]
-            # In each part the disc is one node, also where its cells touch only outside of it: a
-            # tie, an extra edge, joins each to the first one, and no piece may cross it either.
-            at = tree.lo[inner][:, None]
-            below = (lo <= at) & (at < hi)
-            hub = (tree.part[inner][:, None] == tree.part[inner]).argmax(axis=1)
-            words = {}
-            for q in np.unique(arc).tolist():
-                odd = np.count_nonzero(below[:, behind == q], axis=1) % 2
-                crossed = ties[: len(odd)][odd != odd[hub]]
-                words[q] = int(np.bitwise_xor.reduce(np.append(word[arc == q], crossed)))
-            for arcs_of_piece in _relations(words):
-                mine = np.zeros(len(is_free[k]), bool)
-                mine[arcs_of_piece] = True
-                some = outer[mine[arc]][0]
-                mine = mine[behind]
-                yield group[k], tree.part[some], area[mine].sum(), lo[mine], hi[mine], sign[mine]
-
-
-def _relations(words: dict[int, int]) -> list[list[int]]:
-    """The disjoint least sets of keys whose words XOR to 0, by elimination over GF(2)."""
-    basis: dict[int, tuple[int, set[int]]] = {}  # by leading bit: a word, and the keys that make it
-    found = []
-    for key, word in words.items():
-        keys = {key}
-        while word and word.bit_length() in basis:
-            other, used = basis[word.bit_length()]
-            word, keys = word ^ other, keys ^ used
-        if word:
-            basis[word.bit_length()] = (word, keys)
-        else:
-            found.append(list(keys))
-    return found
-
-
-def _spans(lo, hi, sign):
-    """What a signed sum of nested intervals leaves, as slices."""
-    at = np.append(lo, hi)
-    order = np.argsort(at)
-    at, depth = at[order], np.cumsum(np.append(sign, -sign)[order])
-    kept = np.flatnonzero((depth[:-1] > 0) & (at[1:] > at[:-1]))
-    return [slice(a, b) for a, b in zip(at[kept].tolist(), at[kept + 1].tolist(), strict=True)]
+    return out.reshape(free.shape), np.array(cuts, int).reshape(-1, 3)
 
 
 def _way_out(free, label):
