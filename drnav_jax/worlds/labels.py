@@ -65,7 +65,7 @@ class DeadEndLabels(NamedTuple):
     gap: Float32[np.ndarray, "H W"]  # [m] of the narrowest gate that cuts the cell off, else inf
     pocket: Int32[np.ndarray, "H W"]  # id, from 1, of the outermost pocket; 0 = none
     mouth: Int32[np.ndarray, "P 2"]  # (row, column) of each pocket's gate; may lie off the grid
-    mouth_gap: Float32[np.ndarray, " P"]  # [m] its gap. Of all gates it cuts off the largest area
+    mouth_gap: Float32[np.ndarray, " P"]  # [m] its gap. Of the gates outside of the pocket it cuts off most
 
 
 def dead_ends(
@@ -99,7 +99,7 @@ def dead_ends(
     half = spec.mouth / 2 - spec.radius
     rim = int(np.ceil((spec.mouth / 2 + spec.radius) / resolution)) + 3
     pad = max(rim + 1, int(np.ceil((half + spec.mouth / 2) / resolution)) + 5)  # no disc gets there
-    reach = _clearance(occupied, resolution, clearance, pad) - spec.radius
+    reach = clearance_of(occupied, resolution, clearance, pad) - spec.radius
     free = reach > 0
     free[[0, -1]] = free[:, [0, -1]] = False  # flat offsets never wrap around
     ridge = free & (reach <= half)
@@ -125,12 +125,13 @@ def dead_ends(
     met = np.bincount(pocket.ravel(), minlength=component.max() + 1)[1:] > 0
     number = np.append(0, np.where(met, np.cumsum(met), 0))  # some lie outside
     mouth = np.zeros(number.max() + 1, int)  # gate of each; a later one of the same area is narrower
-    for gate, cell in cuts[np.argsort(cuts[:, 0], kind="stable"), 1:].tolist():
+    outermost = np.lexsort((cuts[:, 0], ~label[tuple(gates[cuts[:, 1]].T)]))  # stable
+    for gate, cell in cuts[outermost, 1:].tolist():
         mouth[number[component.flat[cell]]] = gate
     mouth = mouth[1:]
     return DeadEndLabels(
         label=label[inside],
-        depth=(_way_out(free, label) * resolution)[inside].astype(np.float32),
+        depth=(way_out(free, label) * resolution)[inside].astype(np.float32),
         gap=gap[inside].astype(np.float32),
         pocket=number[pocket].astype(np.int32),
         mouth=(gates[mouth] - pad).astype(np.int32),
@@ -155,8 +156,8 @@ def _check(occupied, resolution, trip_path, clearance, spacing):
             raise ValueError(f"trip_path must stay in the {shape} cells of the grid, got {cell}.")
 
 
-def _clearance(occupied, resolution, known, pad):
-    """Clearance of eq. 1 on the padded grid."""
+def clearance_of(occupied, resolution, known=None, pad=0):
+    """Clearance d of eq. 1 [m] on the grid padded by `pad` free cells, inf where nothing is occupied."""
     grid = np.pad(occupied, pad)
     d = np.full(grid.shape, np.inf)
     if occupied.any():
@@ -166,7 +167,7 @@ def _clearance(occupied, resolution, known, pad):
         # On a grid they are integers: without float32's noise ties fall as if d were not given.
         whole = np.abs(squares - np.rint(squares)) < 1e-2
         squares[whole] = np.rint(squares[whole])
-        d[pad:-pad, pad:-pad] = np.sqrt(squares) * resolution - 0.5 * resolution
+        d[pad : d.shape[0] - pad, pad : d.shape[1] - pad] = np.sqrt(squares) * resolution - 0.5 * resolution
     return d
 
 
@@ -229,8 +230,11 @@ def _narrowest(free, anchors, counted, gates, squares, reach, resolution, spec):
     return out.reshape(free.shape), np.array(cuts, int).reshape(-1, 3)
 
 
-def _way_out(free, label):
-    """Length [cells] of the way in F, 8-connected, from each labelled cell to one without label."""
+def way_out(free, label):
+    """Length [cells] of the way in F, 8-connected, from each labelled cell to one without label.
+
+    0 where there is none. Cells on the grid's edge must not be labelled.
+    """
     width, shape = free.shape[1], free.shape
     near_label = ndimage.binary_dilation(label, _BOX) & free
     free, label, cells = free.ravel(), label.ravel(), np.flatnonzero(near_label)
