@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy import ndimage
 
 from drnav_jax import metrics, navigator, worlds
 from drnav_jax.models import geometric, oracle, silent
@@ -21,7 +20,7 @@ from drnav_jax.sim.episode import EpisodeParams, EpisodeSpec
 from drnav_jax.sim.lidar import LidarParams
 from drnav_jax.types import GridMap, RobotParams
 from drnav_jax.worlds import Scene
-from drnav_jax.worlds.labels import LabelSpec, dead_ends
+from drnav_jax.worlds.truth import TruthSpec, truth
 
 PREDICTORS = ("geometric", "oracle", "none")
 LABEL_RESOLUTION = 0.1  # [m] labels need no finer grid
@@ -144,34 +143,14 @@ def _float32(values: Any) -> Any:
     return np.asarray(values, np.float32)
 
 
-def _distance(mask: np.ndarray) -> np.ndarray:
-    """Distance of each cell to the mask [cells]."""
-    return np.asarray(ndimage.distance_transform_edt(~mask))
-
-
 def label_map(trip: Trip, radius: float) -> GridMap:
     """Trip-conditioned true labels (`worlds.labels`) as the oracle reads them: 1 = dead end.
 
     Labels are defined where a robot's centre may be; they are grown by its radius so that they fill their pockets.
     """
-    scene = trip.scene
-    occupied, resolution, field = scene.occupied, scene.resolution, None
-    if resolution < LABEL_RESOLUTION - 1e-6:
-        shape = tuple(int(n * resolution / LABEL_RESOLUTION) for n in occupied.shape)
-        centres = [((np.arange(n) + 0.5) * LABEL_RESOLUTION / resolution - 0.5) for n in shape]
-        fine = worlds.distance_field(occupied, resolution)
-        field = ndimage.map_coordinates(fine, np.meshgrid(*centres, indexing="ij"), order=1, mode="nearest")
-        occupied, resolution = field <= 0, LABEL_RESOLUTION
-    cells = worlds.trip_cells(trip.path, scene.origin, resolution)
-    inside = np.all((cells >= 0) & (cells < np.asarray(occupied.shape)), axis=1)
-    mouth = 5.0 if scene.outside_is_free else 2.5
-    spec = LabelSpec(radius=radius, mouth=mouth)
-    label = dead_ends(occupied, resolution, spec, trip_path=cells[inside]).label
-    grown = _distance(label) * resolution <= radius if label.any() else label
-    # growing must not reach out of the mouth: only over cells where no robot's centre can be
-    clearance = _distance(occupied) * resolution if occupied.any() else np.full(label.shape, 9.0)
-    filled = label | (grown & (clearance <= radius + 0.5 * resolution))
-    return GridMap(values=_float32(filled), origin=_float32(scene.origin), resolution=_float32(resolution))
+    known = truth(trip.scene, TruthSpec(radius=radius, resolution=LABEL_RESOLUTION), trip_path=trip.path)
+    values, origin = _float32(known.label), _float32(known.origin)
+    return GridMap(values=values, origin=origin, resolution=_float32(known.resolution))
 
 
 def params_of(setup: Setup) -> NavParams:

@@ -167,7 +167,7 @@ def clearance_of(occupied, resolution, known=None, pad=0):
         # On a grid they are integers: without float32's noise ties fall as if d were not given.
         whole = np.abs(squares - np.rint(squares)) < 1e-2
         squares[whole] = np.rint(squares[whole])
-        d[pad : d.shape[0] - pad, pad : d.shape[1] - pad] = np.sqrt(squares) * resolution - 0.5 * resolution
+        d[pad : pad + len(occupied), pad : pad + occupied.shape[1]] = np.sqrt(squares) * resolution - 0.5 * resolution
     return d
 
 

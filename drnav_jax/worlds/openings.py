@@ -5,8 +5,9 @@ A sector is OPEN iff some continuation in it gets `straight` away within `travel
     (1)  open(s) = some c in F : |c - x| >= straight, |bearing(c) - s| <= 45 deg, way(x, c) <= travel, good(c)
     (2)  good(c) = c is no dead end, or depth(c) <= depth(x) - |c - x| / sqrt 2
 
-with x the robot, s in {0, 90, -90 deg} to the left of its heading, F where its centre may be and way(x, c) the length of
-the way in F. The second half of eq. 2 is for a robot that is in a dead end itself: the way out of it is none.
+with x the robot, s in {0, 90, -90 deg} to the left of its heading, F where its centre may be, and way(x, c) the length of
+the way in F that never enters the quadrant behind the robot: to turn back is no continuation. The second half of eq. 2
+is for a robot that is in a dead end itself: the way out is none.
 
 Ways are not measured, only told apart by whether they are short enough. Of n = 0.96 travel / cell steps every
 sqrt 2 + 1st, on average, goes to 8 neighbours and the others to 4, so what n steps reach in the open is a regular octagon
@@ -21,12 +22,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt64
+from jaxtyping import Bool, Float, Int
 
 from drnav_jax.worlds.truth import GroundTruth
 
 SECTORS = ("front", "left", "right")
-_QUADRANT = (0, 1, 3)  # quarter turns to the left of the heading
 _OCTAGON = 0.96  # half way between the circles within and around the octagon
 _ASTRAY = 0.3  # [m] a robot is this near to F at least, however coarse the grid
 
@@ -83,66 +83,66 @@ def openings(
     turns = spec.turn * np.array([0, 1, -1])
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     ahead, aside = np.stack([c, s], axis=1)[:, None], np.stack([-s, c], axis=1)[:, None]
-    starts = poses[:, None, :2] + ahead * moves[:, :1] + aside * moves[:, 1:]
-    size = 64 // len(moves)
-    parts = [slice(k, k + size) for k in range(0, len(poses), size)]
-    found = [_open(truth, starts[p], poses[p, 2, None] + turns, spec) for p in parts]
-    shape = (0, len(moves), len(turns), 3)
-    is_open = np.concatenate([np.zeros(shape, bool), *(f for f, _ in found)])
-    known = np.concatenate([np.zeros(shape[:2], bool), *(k for _, k in found)])[..., None]
-    dead_end, nominal = ~is_open.any(axis=-1), is_open[:, 0, 0]
-    same = ((is_open == nominal[:, None, None]) | ~known[..., None]).all(axis=(1, 2))
-    same_end = ((dead_end == dead_end[:, :1, :1]) | ~known).all(axis=(1, 2))
-    there = known[:, 0, 0]
-    return Openings(nominal, same & there[:, None], dead_end[:, 0, 0], same_end & there)
+    places = poses[:, None, :2] + ahead * moves[:, :1] + aside * moves[:, 1:]
+    shape = (len(poses), len(moves), len(turns))
+    near = np.empty((*shape, 3))
+    near[..., :2], near[..., 2] = places[:, :, None], poses[:, 2, None, None] + turns
+    near = near.reshape(len(poses), len(moves) * len(turns), 3)
+    size = max(1, 64 // near.shape[1])
+    found = [_open(truth, near[k : k + size], spec) for k in range(0, len(poses), size)]
+    is_open = np.concatenate([np.zeros((0, near.shape[1], 3), bool), *(f for f, _ in found)])
+    known = np.concatenate([np.zeros((0, near.shape[1]), bool), *(k for _, k in found)])
+    dead_end = np.logical_not(np.any(is_open, axis=-1))
+    same = np.all((is_open == is_open[:, :1]) | ~known[..., None], axis=1)
+    same_end = np.all((dead_end == dead_end[:, :1]) | ~known, axis=1)
+    there = known[:, 0]
+    return Openings(is_open[:, 0], same & there[:, None], dead_end[:, 0], same_end & there)
 
 
 def _open(
-    truth: GroundTruth, starts: Float[np.ndarray, "n M 2"], yaws: Float[np.ndarray, "n Y"], spec: OpeningSpec
-) -> tuple[Bool[np.ndarray, "n M Y 3"], Bool[np.ndarray, "n M"]]:
-    """Eq. 1 for n robots, each from M places with Y headings; and which of the places are in F."""
-    n, m = starts.shape[:2]
+    truth: GroundTruth, poses: Float[np.ndarray, "n M 3"], spec: OpeningSpec
+) -> tuple[Bool[np.ndarray, "n M 3"], Bool[np.ndarray, "n M"]]:
+    """Eq. 1 for n robots, each in M poses about its first; and which of them are in F."""
+    n, m = poses.shape[:2]
     cell = truth.resolution
     num_steps = round(_OCTAGON * spec.travel / cell)
     half = num_steps + math.ceil(spec.shift / cell) + math.ceil(_ASTRAY / cell) + 2
-    corner = np.floor((starts[:, 0, ::-1] - truth.origin[::-1]) / cell).astype(int) - half
+    at = np.floor((poses[..., 1::-1] - truth.origin[::-1]) / cell).astype(int)  # (row, column)
+    corner = at[:, 0] - half
     rows, columns = (corner[:, k, None] + np.arange(2 * half + 1) for k in (0, 1))
     free, label, depth = _crops(truth, rows, columns)
     free[:, [0, -1]] = free[:, :, [0, -1]] = False  # shifts never wrap around
-
-    at = np.floor((starts[..., ::-1] - truth.origin[::-1]) / cell).astype(int) - corner[:, None]
+    at -= corner[:, None]
     known = free[np.arange(n)[:, None], at[..., 0], at[..., 1]]
     for k in np.flatnonzero(~known[:, 0]):
         cells = np.argwhere(free[k])
         centre = (cells + corner[k] + 0.5)[:, ::-1] * cell + truth.origin
-        away = np.hypot(*(centre - starts[k, 0]).T)
+        away = np.hypot(*(centre - poses[k, 0, :2]).T)
         if len(away) and away.min() <= max(_ASTRAY, 1.5 * cell):
-            at[k, 0], known[k, 0] = cells[away.argmin()], True
+            same = (poses[k, :, :2] == poses[k, 0, :2]).all(axis=1)
+            at[k, same], known[k, same] = cells[away.argmin()], True
 
-    bit = np.uint64(1) << np.arange(n * m, dtype=np.uint64).reshape(n, m)
-    words = np.bitwise_or.reduce(
-        np.where(free, np.bitwise_or.reduce(bit, axis=1)[:, None, None], np.uint64(0)), axis=0
-    )
-    reached = np.zeros_like(words)
-    np.bitwise_or.at(reached, (at[known][:, 0], at[known][:, 1]), bit[known])
-    reached = _spread(reached, words, num_steps)
-
-    lit = np.unpackbits(reached.astype("<u8").view(np.uint8).reshape(*reached.shape, 8), axis=-1, bitorder="little")
-    i, j, b = np.nonzero(lit)
-    robot, place = np.divmod(b, m)
-    x = (columns[robot, j] + 0.5) * cell + truth.origin[0] - starts[robot, place, 0]
-    y = (rows[robot, i] + 0.5) * cell + truth.origin[1] - starts[robot, place, 1]
-    distance = np.hypot(x, y)
-    here = depth[np.arange(n)[:, None], at[..., 0], at[..., 1]]
-    good = ~label[robot, i, j] | (depth[robot, i, j] <= here[robot, place] - distance / math.sqrt(2))
-    good &= distance >= spec.straight - 1e-9
-    x, y, robot, b = x[good], y[good], robot[good], b[good]
-    bearing = np.arctan2(y, x)
-    is_open = np.zeros((n * m, yaws.shape[1], 4), bool)
-    for k in range(yaws.shape[1]):
-        quarter = np.floor((bearing - yaws[robot, k]) / (math.pi / 2) + 0.5).astype(int) % 4
-        is_open[b, k, quarter] = True
-    return is_open.reshape(n, m, -1, 4)[..., _QUADRANT], known
+    sets = np.zeros((2, 64, *free.shape[1:]), bool)  # where each may be, and is at first
+    fits = np.empty((n * m, 3, *free.shape[1:]), bool)  # cells of eq. 1 but for the way there
+    for b in range(n * m):
+        k, (i, j) = b // m, at[b // m, b % m]
+        x, y, yaw = poses[k, b % m]
+        x = (columns[k] + 0.5) * cell + truth.origin[0] - x
+        y = ((rows[k] + 0.5) * cell + truth.origin[1] - y)[:, None]
+        c, s = math.cos(yaw + math.pi / 4), math.sin(yaw + math.pi / 4)
+        left, right = c * x >= -s * y, s * x >= c * y  # of the lines at -45 and 45 degrees: both are in front
+        good = ~label[k]
+        if label[k, i, j]:
+            good |= depth[k] <= depth[k, i, j] - np.hypot(x, y) / math.sqrt(2)
+        good &= x**2 >= spec.straight**2 - y**2
+        for sector, within in enumerate((left & right, left & ~right, right & ~left)):
+            np.logical_and(good, within, out=fits[b, sector])
+        if known[k, b % m]:
+            np.logical_and(free[k], left | right, out=sets[0, b])
+            sets[:, b, i, j] = True
+    reached = _spread(sets[1], sets[0], num_steps)
+    is_open = [(fits[b] & reached[b]).any(axis=(1, 2)) for b in range(n * m)]
+    return np.reshape(is_open, (n, m, 3)), known
 
 
 def _crops(
@@ -158,17 +158,19 @@ def _crops(
 
 
 def _spread(
-    reached: UInt64[np.ndarray, "L L"], free: UInt64[np.ndarray, "L L"], num_steps: int
-) -> UInt64[np.ndarray, "L L"]:
-    """Sets of cells, one in each bit, after some steps in what is free for each; its edge must not be."""
-    width = reached.shape[1]
-    free, now = free.ravel(), reached.ravel() & free.ravel()
+    starts: Bool[np.ndarray, "64 L L"], free: Bool[np.ndarray, "64 L L"], num_steps: int
+) -> Bool[np.ndarray, "64 L L"]:
+    """64 sets of cells after some steps through what is free for each; the grid's edge must not be."""
+    width = free.shape[2]
+    now, may = (
+        np.ascontiguousarray(np.packbits(s.reshape(64, -1), axis=0).T).view(np.uint64)[:, 0] for s in (starts, free)
+    )
 
     def grown(cells: np.ndarray, by: int) -> np.ndarray:
         out = cells.copy()
         out[by:] |= cells[:-by]
         out[:-by] |= cells[by:]
-        out &= free
+        out &= may
         return out
 
     diagonals = np.floor(np.arange(num_steps + 1) * (math.sqrt(2) - 1))
@@ -176,5 +178,7 @@ def _spread(
         along, across = grown(now, 1), grown(now, width)
         if is_diagonal:  # around a corner only by way of a cell beside it
             along, across = grown(along, width), grown(across, 1)
-        now = along | across
-    return now.reshape(reached.shape)
+        now = along
+        now |= across
+    words = np.ascontiguousarray(now[:, None].view(np.uint8).T)
+    return np.unpackbits(words, axis=0).reshape(free.shape).view(bool)

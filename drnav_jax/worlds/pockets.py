@@ -59,7 +59,7 @@ def pockets(
     for k, box in enumerate(ndimage.find_objects(pocket, count)):
         rows, columns = (slice(max(b.start - pad, 0), b.stop + pad) for b in box)
         here, outside = pocket[rows, columns] == k + 1, free[rows, columns] & (pocket[rows, columns] == 0)
-        near = outside & (ndimage.distance_transform_edt(~here) * resolution <= NEAR + 1e-6)
+        near = outside & (np.asarray(ndimage.distance_transform_edt(~here)) * resolution <= NEAR + 1e-6)
         way = way_out(np.pad(near | here, 1), np.pad(near, 1))[1:-1, 1:-1] * resolution
         score = np.where((way > 0) & (way <= NEAR + 1e-6), value[rows, columns] - WAY_WEIGHT * way, -np.inf)
         i, j = np.unravel_index(np.argmax(score), score.shape)

@@ -116,7 +116,7 @@ def _make(scene: Scene, spec: TruthSpec, trip_path: np.ndarray | None) -> Ground
     # growing must not reach out of the mouth: only over cells where no robot's centre can be
     label, near = labels.label, np.indices(occupied.shape)
     if label.any():
-        distance, near = ndimage.distance_transform_edt(~label, return_indices=True)
+        distance, near = _nearest(label)
         label = label | (~standable & (distance * resolution <= spec.radius))
     of = lambda values, fill: np.where(label, values[tuple(near)], fill)  # noqa: E731
     return GroundTruth(
@@ -126,7 +126,7 @@ def _make(scene: Scene, spec: TruthSpec, trip_path: np.ndarray | None) -> Ground
         pocket=of(labels.pocket, 0).astype(np.uint16),
         traversable=~occupied,
         standable=standable,
-        defined=~occupied & (ndimage.distance_transform_edt(~standable) * resolution <= spec.radius),
+        defined=~occupied & (_nearest(standable)[0] * resolution <= spec.radius),
         clearance=np.clip(clearance, -1.0, _FAR).astype(np.float16),
         pockets=pockets(
             labels, occupied, scene.origin, resolution, radius=spec.radius, room_area=spec.room_area
@@ -136,6 +136,12 @@ def _make(scene: Scene, spec: TruthSpec, trip_path: np.ndarray | None) -> Ground
         radius=float(spec.radius),
         outside_is_free=bool(scene.outside_is_free),
     )
+
+
+def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance [cells] `[H, W]` of each cell to the mask, and the cell `[2, H, W]` of it that is nearest."""
+    found: Any = ndimage.distance_transform_edt(~mask, return_indices=True)
+    return found
 
 
 def _coarse(scene: Scene, resolution: float) -> tuple[np.ndarray, float]:
@@ -207,7 +213,7 @@ def _read(file: Path) -> GroundTruth | None:
 def _write(file: Path, made: GroundTruth) -> None:
     """Write under a temporary name, then rename: whoever reads sees all of it or nothing."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    fields = _flat(made)
+    fields: Any = _flat(made)
     handle, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.stem}-", suffix=".tmp")
     try:
         with os.fdopen(handle, "wb") as stream:
