@@ -62,7 +62,7 @@ class GroundTruth(NamedTuple):
     pocket: UInt16[np.ndarray, "H W"]  # k + 1 for row k of `pockets`; 0 = none
     traversable: Bool[np.ndarray, "H W"]  # nothing there stops a robot
     standable: Bool[np.ndarray, "H W"]  # F: the robot's centre may be there
-    defined: Bool[np.ndarray, "H W"]  # traversable and within R of F: where labels mean something
+    defined: Bool[np.ndarray, "H W"]  # within R of what can be reached of F: where labels mean something
     clearance: Float16[np.ndarray, "H W"]  # [m] to what stops a robot, at most 100; < 0 in it
     pockets: Pockets
     origin: Float[np.ndarray, "2"]  # world x, y of the outer corner of cell (0, 0) [m]
@@ -113,6 +113,7 @@ def _make(scene: Scene, spec: TruthSpec, trip_path: np.ndarray | None) -> Ground
     labels = dead_ends(occupied, resolution, LabelSpec(radius=spec.radius, mouth=mouth), trip_path=cells)
     clearance = clearance_of(occupied, resolution)
     standable = clearance > spec.radius
+    reachable = _reachable(standable, scene.outside_is_free, cells)
     # growing must not reach out of the mouth: only over cells where no robot's centre can be
     label, near = labels.label, np.indices(occupied.shape)
     if label.any():
@@ -126,7 +127,7 @@ def _make(scene: Scene, spec: TruthSpec, trip_path: np.ndarray | None) -> Ground
         pocket=of(labels.pocket, 0).astype(np.uint16),
         traversable=~occupied,
         standable=standable,
-        defined=~occupied & (_nearest(standable)[0] * resolution <= spec.radius),
+        defined=~occupied & (_nearest(reachable)[0] * resolution <= spec.radius),
         clearance=np.clip(clearance, -1.0, _FAR).astype(np.float16),
         pockets=pockets(
             labels, occupied, scene.origin, resolution, radius=spec.radius, room_area=spec.room_area
@@ -142,6 +143,20 @@ def _nearest(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance [cells] `[H, W]` of each cell to the mask, and the cell `[2, H, W]` of it that is nearest."""
     found: Any = ndimage.distance_transform_edt(~mask, return_indices=True)
     return found
+
+
+def _reachable(standable: np.ndarray, outside_is_free: bool, cells: np.ndarray | None) -> np.ndarray:
+    """The parts of F on which there are robots: what a trip's cells touch, else what outside does, else the largest."""
+    part = np.zeros([n + 2 for n in standable.shape], np.int32)
+    ndimage.label(np.pad(standable, 1, constant_values=outside_is_free), output=part)
+    outside, inside = part[0, 0], part[1:-1, 1:-1]
+    if cells is not None:
+        met = inside[tuple(cells.T)]
+    elif outside_is_free:
+        met = outside
+    else:
+        met = np.argmax(np.bincount(inside[standable], minlength=2)[1:]) + 1
+    return standable & np.isin(inside, met)
 
 
 def _coarse(scene: Scene, resolution: float) -> tuple[np.ndarray, float]:

@@ -61,6 +61,18 @@ def test_equals_its_definition():
     assert made.defined[22:40, 40:58].mean() > 0.97 and not made.defined[occupied].any()
 
 
+@pytest.mark.parametrize(("outside_is_free", "trip", "row"), [(True, False, 3), (False, False, 3), (False, True, 27)])
+def test_labels_mean_nothing_where_no_robot_gets(outside_is_free, trip, row):
+    """Of a plan that a wall divides, the larger part counts, or the one that the trip is in."""
+    grid = np.zeros((30, 40), bool)
+    grid[[0, -1]] = grid[:, [0, -1]] = grid[18] = True
+    grid[0] = not outside_is_free
+    path = np.array([[3.0, 1.4], [5.0, 1.4]]) if trip else None
+    made = truth(scene_of(grid, outside_is_free=outside_is_free), trip_path=path)
+    assert made.defined[row, 20] and not made.defined[30 - row, 20]
+    assert made.standable[25, 20] and made.standable[5, 20]
+
+
 def test_types_are_small():
     made = truth(scene_of(tube()))
     kinds = [bool, np.float16, np.float16, np.uint16, bool, bool, bool, np.float16]
