@@ -113,7 +113,7 @@ def pieces(tree, shape, small, gates, squares, rng):
     what it does not hold, so that the area is <= 0.
     """
     gates = gates @ (shape[1], 1)
-    ties = rng.integers(0, 2**64, 8 * int(np.sqrt(squares.max(initial=0))) + 8, np.uint64)
+    ties = rng.integers(0, 2**64, 16 * int(np.sqrt(squares.max(initial=0))) + 16, np.uint64)
     for value in np.unique(squares)[::-1]:
         group = np.flatnonzero(squares == value)
         rim = _rim(int(value), shape)
@@ -121,57 +121,75 @@ def pieces(tree, shape, small, gates, squares, rng):
         is_free = tree.part[ring] > 0
         begins = is_free & ~np.roll(is_free, 1, axis=1)
         num_arcs = begins.sum(axis=1)
-        arcs = (np.cumsum(begins, axis=1) - 1) % np.maximum(num_arcs, 1)[:, None]
-        for k in np.flatnonzero((num_arcs > 1) | small[ring].any(axis=1)):
-            gate = gates[group[k]]
-            linked = is_free[k, rim.at] & (tree.part[gate + rim.inner] > 0)
-            inner, outer = gate + rim.inner[linked], ring[k, rim.at[linked]]
-            if not len(inner):
-                continue
-            arc = arcs[k, rim.at[linked]]
-            down = tree.parent[outer] == inner
-            cut = down | (tree.parent[inner] == outer)
-            top = np.where(down, outer, inner)[cut]
-            lo, hi, sign, behind = tree.lo[top], tree.hi[top], np.where(down, 1, -1)[cut], arc[cut]
-            area = sign * (tree.area[hi] - tree.area[lo])
-            word = tree.word[gate + rim.edge[linked]]
-            word[cut] ^= tree.leaving[hi] ^ tree.leaving[lo]
-            # In each part the disc is one node, also where its cells touch only outside of it: a
-            # tie, an extra edge, joins each to the first one, and no piece may cross it either.
-            at = tree.lo[inner][:, None]
-            below = (lo <= at) & (at < hi)
-            hub = (tree.part[inner][:, None] == tree.part[inner]).argmax(axis=1)
-            words = {}
-            for q in np.unique(arc).tolist():
-                odd = np.count_nonzero(below[:, behind == q], axis=1) % 2
-                crossed = ties[: len(odd)][odd != odd[hub]]
-                words[q] = int(np.bitwise_xor.reduce(np.append(word[arc == q], crossed)))
-            for arcs_of_piece in _relations(words):
-                mine = np.zeros(len(is_free[k]), bool)
-                mine[arcs_of_piece] = True
-                some = outer[mine[arc]][0]
-                mine = mine[behind]
-                yield group[k], tree.part[some], area[mine].sum(), lo[mine], hi[mine], sign[mine]
+        kept = (num_arcs > 1) | small[ring].any(axis=1)
+        group, ring, is_free, num_arcs = group[kept], ring[kept], is_free[kept], num_arcs[kept]
+        arcs = (np.cumsum(begins[kept], axis=1) - 1) % np.maximum(num_arcs, 1)[:, None]
+        arcs += np.append(0, np.cumsum(num_arcs))[:-1, None]  # numbered through
+        linked = is_free[:, rim.at] & (tree.part[gates[group, None] + rim.inner] > 0)
+        which, edge = np.nonzero(linked)
+        if not len(which):
+            continue
+        arc = arcs[which, rim.at[edge]]
+        order = np.argsort(arc, kind="stable")
+        which, edge, arc = which[order], edge[order], arc[order]
+        gate = gates[group[which]]
+        inner, outer = gate + rim.inner[edge], ring[which, rim.at[edge]]
+        down = tree.parent[outer] == inner
+        cut = down | (tree.parent[inner] == outer)
+        top = np.where(down, outer, inner)[cut]
+        lo, hi, sign = tree.lo[top], tree.hi[top], np.where(down, 1, -1)[cut]
+        word = tree.word[gate + rim.edge[edge]]
+        word[cut] ^= tree.leaving[hi] ^ tree.leaving[lo] ^ _tied(tree, which, inner, cut, lo, hi, ties[edge])
+        first = np.flatnonzero(np.diff(arc, prepend=-1))  # edge of each arc that has some
+        words = np.bitwise_xor.reduceat(word, first).tolist()
+        at = np.append(0, np.cumsum(cut))[np.append(first, len(arc))].tolist()  # its edges in the tree
+        area = np.append(0, np.cumsum(sign * (tree.area[hi] - tree.area[lo]))).tolist()
+        bounds = [*np.flatnonzero(np.diff(which[first], prepend=-1)).tolist(), len(first)]
+        for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+            k, part = group[which[first[a]]], tree.part[outer[first[a:b]]].tolist()
+            for found in _relations(words[a:b]):
+                here = sum(area[at[a + q + 1]] - area[at[a + q]] for q in found)
+                mine = np.concatenate([np.arange(at[a + q], at[a + q + 1]) for q in found])
+                yield k, part[found[0]], here, lo[mine], hi[mine], sign[mine]
 
 
-def _relations(words: dict[int, int]) -> list[list[int]]:
-    """The disjoint least sets of keys whose words XOR to 0, by elimination over GF(2)."""
-    basis: dict[int, tuple[int, set[int]]] = {}  # by leading bit: a word, and the keys that make it
+def _tied(tree, which, inner, cut, lo, hi, ties):
+    """What ties add to the words that leave the subtrees cut, by edge across the rim of one disc or another.
+
+    In each part a disc is one node, also where its cells touch only outside of it: a tie, an extra
+    edge, joins each to the first one, and no piece may cross it either.
+    """
+    nodes, hub, node = np.unique(which * (tree.part.max() + 1) + tree.part[inner], return_index=True, return_inverse=True)
+    order = np.argsort(node, kind="stable")
+    ends = ties.copy()  # of the ties at each cell; the hub has all of them
+    ends[hub] ^= np.bitwise_xor.reduceat(ties[order], np.searchsorted(node[order], np.arange(len(nodes))))
+    place = which * len(tree.leaving) + tree.lo[inner]
+    order = np.argsort(place)
+    place, passed = place[order], np.append(np.uint64(0), np.bitwise_xor.accumulate(ends[order]))
+    base = which[cut] * len(tree.leaving)
+    return passed[np.searchsorted(place, base + hi)] ^ passed[np.searchsorted(place, base + lo)]
+
+
+def _relations(words: list[int]) -> list[list[int]]:
+    """The disjoint least sets of numbers of words whose XOR is 0, by elimination over GF(2)."""
+    basis: dict[int, tuple[int, set[int]]] = {}  # by leading bit: a word, and the numbers that make it
     found = []
-    for key, word in words.items():
-        keys = {key}
+    for number, word in enumerate(words):
+        numbers = {number}
         while word and word.bit_length() in basis:
             other, used = basis[word.bit_length()]
-            word, keys = word ^ other, keys ^ used
+            word, numbers = word ^ other, numbers ^ used
         if word:
-            basis[word.bit_length()] = (word, keys)
+            basis[word.bit_length()] = (word, numbers)
         else:
-            found.append(list(keys))
+            found.append(list(numbers))
     return found
 
 
 def spans(lo, hi, sign):
     """What a signed sum of nested intervals leaves, as slices."""
+    if len(lo) == 1:
+        return [slice(int(lo[0]), int(hi[0]))]
     at = np.append(lo, hi)
     order = np.argsort(at)
     at, depth = at[order], np.cumsum(np.append(sign, -sign)[order])
