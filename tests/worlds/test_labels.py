@@ -1,11 +1,14 @@
 """Dead-end labels: the case table, invariances, trips, and equality with brute force."""
 
+import time
+
 import jaxtyping
 import numpy as np
 import pytest
 import reference_labels as reference
 from PIL import Image
 
+from drnav_jax import worlds
 from drnav_jax.worlds.labels import LabelSpec, dead_ends
 
 # Under the suite's shape checks a wrong shape or dtype is refused before our own check sees it.
@@ -377,3 +380,60 @@ def test_input_is_refused(changes, rule):
 def test_shape_or_dtype_is_refused(changes):
     with pytest.raises(REFUSED):
         dead_ends(**{"occupied": np.zeros((8, 9), bool), "resolution": 0.1, **changes})
+
+
+@pytest.mark.parametrize("family", sorted(set(worlds.FAMILIES.values()) - {"open"}))
+def test_families_turned_mirrored_and_finer(family):
+    """Whatever a family draws: a quarter turn and a mirror change nothing, half the cells next to nothing."""
+    for seed in range(2):
+        scene = worlds.sample(family, seed, "train")
+        label = dead_ends(scene.occupied, 0.1).label
+        for turn in (np.rot90, np.fliplr, np.transpose):
+            turned = dead_ends(np.ascontiguousarray(turn(scene.occupied)), 0.1).label
+            assert np.mean(turned == turn(label)) >= SYMMETRY
+        shape = (2 * label.shape[0], 2 * label.shape[1])
+        fine = dead_ends(worlds.rasterise(scene.world, scene.origin, shape, 0.05), 0.05).label
+        coarse = label.repeat(2, axis=0).repeat(2, axis=1)
+        assert label.any() and (coarse & fine).sum() / (coarse | fine).sum() >= RESAMPLED
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_obstacle_inside_opens_a_cell(seed):
+    """Pillars and boxes at random, in tubes of random width: while the gate is as wide, the label stays."""
+    rng = np.random.default_rng(seed)
+    for _ in range(8):
+        width = rng.uniform(1.4, 3.4)
+        walls = ((5, 5, 5.3, 15), (5.3 + width, 5, 5.6 + width, 15), (5, 14.7, 5.6 + width, 15))
+        empty = draw(*walls)
+        y, x = rng.uniform((5.3, 6.2 + width), (5.2 + width, 14.2))
+        filled = empty | draw((y, x, y + rng.uniform(0.1, 0.8), x + rng.uniform(0.1, 0.5)))
+        before, after = dead_ends(empty, 0.1), dead_ends(filled, 0.1)
+        np.testing.assert_array_equal(before.mouth[0], after.mouth[0])
+        may_stand = reference.clearance(filled, 0.1) > 0.25
+        assert before.label.any() and not (before.label & may_stand & ~after.label).any()
+
+
+@pytest.mark.slow
+def test_real_floor_turned_and_mirrored(shared_data):
+    scene = worlds.load_map_server(shared_data / "maps/willow/willow-2010-02-18-0.10.yaml")
+    label = dead_ends(scene.occupied, 0.1, LabelSpec(mouth=2.5)).label
+    for turn in (np.rot90, np.fliplr, np.flipud, np.transpose):
+        turned = dead_ends(np.ascontiguousarray(turn(scene.occupied)), 0.1, LabelSpec(mouth=2.5)).label
+        assert np.mean(turned == turn(label)) >= SYMMETRY
+
+
+@pytest.mark.slow
+def test_takes_half_a_second():
+    """400 x 400 cells with 60 walls: more gates than a floor of 40 m has. CPU time, the best of five."""
+    rng = np.random.default_rng(0)
+    occupied = np.zeros((400, 400), bool)
+    for _ in range(60):
+        (i, j), long = rng.integers(0, 400, 2), rng.integers(20, 120)
+        size = (3, long) if rng.random() < 0.5 else (long, 3)
+        occupied[i : i + size[0], j : j + size[1]] = True
+    took = []
+    for _ in range(5):
+        begin = time.process_time()
+        dead_ends(occupied, 0.1)
+        took.append(time.process_time() - begin)
+    assert min(took) <= 0.5
