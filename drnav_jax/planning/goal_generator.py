@@ -147,8 +147,7 @@ def generate(
     chosen_from = candidates(spec, params, robot, pose, twist, goal, last, hysteresis)
     scores = scoring.score(field, chosen_from, params, robot, dt=spec.dt, num_steps=spec.num_steps)
     index = jnp.argmin(scores.score).astype(jnp.int32)
-    best = scoring.at(scores, index)
-    terms = scoring.explain(
+    best, terms = scoring.explain(
         field, scoring.at(chosen_from, index), params, robot, dt=spec.dt, num_steps=spec.num_steps
     )
     valid = best.score[0] < BLOCKED

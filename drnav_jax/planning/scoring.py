@@ -12,13 +12,26 @@ Every prefix x_0..x_k of a rollout is a candidate path; its score is the paper's
     EDE = sum_k exp(-decay s_k) P_dead^foot(x_k) max(ds_k, STANDING_SPEED dt)
 
 and the best prefix represents its candidate: its end is g(theta). With risk_weight = 0 the score is J_geom bit for bit.
+`score` says only how good each candidate is and at which step it is best; `explain` looks at the few one cares about.
 
-What bounds it: one gather per candidate and step. So all layers sit in one word per cell (`costmap`), state is a
-structure of `[K]` arrays carried by a scan, no trigonometry is evaluated inside, and candidates are worked on in blocks
-that stay in the cache, so memory is flat in K.
+What bounds it. One step of one candidate is one table look-up and some 100 arithmetic operations. The look-up is the
+only thing that a CPU does lane by lane; so all layers sit in one word per cell (`costmap`), and positions are counted in
+cells. The rest is spent in loads and stores: XLA turns the body of the scan into one small loop over the block for each
+array that the scan carries, and their number decides. Hence
+
+- whatever a step needs of the speeds is a function of the step's number (a target approached at a limited rate is a
+  ramp), of exp(-decay s_k) the factor per step likewise: no exponential and no trigonometry inside;
+- a carried array is read by its own update only, or it would be copied first (only c and s are);
+- what several updates read is `held`: carried, though the next step ignores it, so that it is computed once;
+- no update does more arithmetic than it moves bytes, or XLA splits it among threads, at more than its own cost;
+- blocks of candidates stay in the second-level cache, so memory is flat in K.
+
+One program runs on one thread of a CPU; `score_on_threads` shares the candidates among several.
 """
 
+import functools
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
@@ -33,6 +46,11 @@ from drnav_jax.planning.exposure import STANDING_SPEED
 from drnav_jax.types import GridMap, RobotParams, Scalar
 
 BLOCKED = 1e9  # score of a candidate none of whose prefixes is free
+BLOCK_SIZE = {"cpu": 4096}  # candidates worked on at a time; elsewhere all the more
+_MANY = 1 << 18
+
+# what becomes of a candidate: it goes on, this step was its last, it has ended, it met an obstacle
+_GOING, _LAST, _ENDED, _HIT = 2.0, 1.0, 0.0, -1.0
 
 
 class ScoreParams(NamedTuple):
@@ -69,6 +87,13 @@ class Scores(NamedTuple):
     """The best prefix of each candidate; all `[K]`."""
 
     score: Array  # J_geom + risk_weight EDE; `BLOCKED` if no prefix is free
+    step: Array  # int32, how many steps it takes; 0 if no prefix is free
+
+
+class Best(NamedTuple):
+    """The best prefix of each candidate, looked at; all `[K]`."""
+
+    score: Array  # as in `Scores`
     x: Array  # its end [m]
     y: Array  # [m]
     arc: Array  # its length [m]
@@ -88,81 +113,110 @@ class Terms(NamedTuple):
     bias: Array
 
 
-_Each = TypeVar("_Each", Candidates, Scores, Terms)
-Reader = Callable[[Array, Array], tuple[Array, Array, Array]]  # (x, y) -> clearance, risk, value
+class Reader(NamedTuple):
+    """How a field is read. The kernel counts x and y from the reader's origin, in the reader's unit."""
+
+    frame: Callable[[Any], tuple[Array, Scalar]]  # field -> origin [m] `[2]`, unit [m]
+    locate: Callable[[Any, Array, Array], Any]  # (field, x, y) -> places: arrays of finite numbers
+    read: Callable[[Any, Any], tuple[Array, Array, Array]]  # (field, places) -> clearance [m], risk, value [m]
 
 
-def look_up(field: GridMap, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Clearance [m], risk and value [m] of the cells under (x, y), out of packed words; beyond the edge the edge's."""
+_Each = TypeVar("_Each", Candidates, Scores, Best, Terms)
+
+
+def _frame(field: GridMap) -> tuple[Array, Scalar]:
+    return field.origin, field.resolution
+
+
+def _locate(field: GridMap, x: Array, y: Array) -> Array:
+    """The cells at (x, y) [cells], counted row by row; beyond the edge the edge's."""
     h, w = field.values.shape
-    inv = 1.0 / field.resolution
-    col = lesser(greater((x - field.origin[0]) * inv, 0.0), w - 1.0).astype(jnp.int32)
-    row = lesser(greater((y - field.origin[1]) * inv, 0.0), h - 1.0).astype(jnp.int32)
-    return costmap.unpack(field.values.reshape(-1).at[row * w + col].get(mode="promise_in_bounds"))
+    col = lesser(greater(x, 0.0), w - 1.0).astype(jnp.int32)
+    row = lesser(greater(y, 0.0), h - 1.0).astype(jnp.int32)
+    return row * w + col
+
+
+def _read(field: GridMap, cell: Array) -> tuple[Array, Array, Array]:
+    """Clearance [m], risk and value [m] out of packed words."""
+    # unsigned: numbers below zero would be counted from the end, at three instructions each
+    index = cell.astype(jnp.uint32)
+    return costmap.unpack(field.values.reshape(-1).at[index].get(mode="promise_in_bounds"))
+
+
+PACKED = Reader(_frame, _locate, _read)
 
 
 def _score_block(
-    read: Reader, start: Candidates, params: ScoreParams, robot: RobotParams, block: Array, dt: float, num_steps: int
-) -> tuple[Scores, Terms]:
-    """Scores of the candidates of one block (module docstring)."""
+    reader: Reader, field: Any, start: Candidates, params: ScoreParams, robot: RobotParams, block: Array, dt: float,
+    num_steps: int, detailed: bool,
+) -> tuple[Scores, Array, tuple[Array, ...]]:
+    """Scores of one block (module docstring), what collisions cost it and, if `detailed`, the best prefixes' details."""
     dv, dw = robot.a_max * dt, robot.alpha_max * dt
     soft = robot.radius + params.soft_clearance
     slope = 1.0 / jnp.maximum(params.soft_clearance - params.margin, 1e-3)
     reach = jnp.minimum(start.reach, params.range_max)
-    horizon = params.horizon + 1e-3 * dt  # k dt is rounded
-    zero = jnp.zeros_like(start.v)
+    v0, w0 = start.motion.v, start.motion.w
+    origin, unit = reader.frame(field)
+    pace = dt / unit
+    x0, y0 = (start.motion.x - origin[0]) / unit, (start.motion.y - origin[1]) / unit
+    zero = jnp.zeros_like(v0)
+    k = jnp.arange(1, num_steps + 1, dtype=jnp.float32)
+    within = k * dt <= params.horizon + 1e-3 * dt  # k dt is rounded
+    # exp(-decay v dt) is held to the limits of v: no exponential is evaluated in the loop
+    thin0, thin_end = jnp.exp(-params.decay * dt * v0), jnp.exp(-params.decay * dt * start.v)
+    gain = jnp.exp(jnp.minimum((params.decay * dt * dv) * k, 80.0))  # finite for any decay
+    # beyond the horizon no prefix ends and nothing blocks
+    least, blocked_below = jnp.where(within, params.range_least, jnp.inf), jnp.where(within, block, -jnp.inf)
 
-    def step(carry: tuple, k: Array) -> tuple[tuple, None]:
-        m, arc, cost, risk_sum, turned, alive, hit, best = carry
-        v, w = approach(m.v, start.v, dv), approach(m.w, start.w, dw)
-        c, s = rotate(m.c, m.s, (0.5 * dt) * (m.w + w))  # heading at the middle of the step
+    def step(carry: tuple, now: tuple[Array, ...]) -> tuple[tuple, None]:
+        (x, y, c, s), arc, weight, cost, state, best, at_step, _, sums, kept = carry
+        k, gain, least, blocked_below = now
+        v, w = approach(v0, start.v, k * dv), approach(w0, start.w, k * dw)
+        twice = w + approach(w0, start.w, (k - 1.0) * dw)
+        c, s = rotate(c, s, (0.5 * dt) * twice)  # heading at the middle of the step
+        x, y = x + v * pace * c, y + v * pace * s
+        place = reader.locate(field, x, y)
+        near, risk, value = reader.read(field, place)
         ds = jnp.abs(v) * dt
-        m = Motion(x=m.x + v * dt * c, y=m.y + v * dt * s, c=c, s=s, v=v, w=w)
-        near, risk, value = read(m.x, m.y)
-        going = alive & (arc < reach) & (k * dt <= horizon)
-        alive = going & (near >= block)
-        hit = hit | (going & (near < block))
         arc = arc + ds
         lack = greater((soft - near) * slope, 0.0)
-        cost = cost + lack * lack * ds
-        risk_sum = risk_sum + jnp.exp(-params.decay * arc) * risk * greater(ds, STANDING_SPEED * dt)
-        turned = turned + jnp.abs(w) * dt
-        geometric = (
-            params.progress * (value + arc)
-            + params.clearance * cost
-            + params.smoothness * turned
-            + params.range_bias * greater(params.range_min - arc, 0.0)
-        )
-        score = geometric + params.risk_weight * risk_sum
-        better = alive & (score < best[0]) & (arc >= params.range_least)
-        now = (score, m.x, m.y, arc, geometric, risk_sum, cost, turned, value)
-        best = tuple(jnp.where(better, a, b) for a, b in zip(now, best, strict=True))
-        return (m, arc, cost, risk_sum, turned, alive, hit, best), None
+        thin = lesser(greater(thin_end, thin0 / gain), thin0 * gain)
+        weight = weight * lesser(thin, 1.0 / thin)
+        exposed = weight * risk * greater(ds, STANDING_SPEED * dt)
+        paid = (params.clearance * lack * lack + params.progress) * ds + (params.smoothness * dt) * jnp.abs(w)
+        cost = cost + (paid + params.risk_weight * exposed)
+        after = jnp.where(near < blocked_below, _HIT, jnp.where(arc < reach, _GOING, _LAST))
+        state = jnp.where(state == _GOING, after, lesser(state, _ENDED))
+        score = cost + params.progress * value + params.range_bias * greater(params.range_min - arc, 0.0)
+        score = jnp.where((state >= _LAST) & (arc >= least), score, BLOCKED)
+        best = lesser(score, best)
+        better = score <= best  # of equal prefixes the longest
+        # not `where(better, k, at_step)`: that becomes a masked store, which some processors do lane by lane
+        at_step = at_step + jnp.where(better, k - at_step, 0.0)
+        held = (v, w, twice, place, exposed, score)
+        if detailed:
+            sums = (sums[0] + lack * lack * ds, sums[1] + exposed, sums[2] + jnp.abs(w) * dt)
+            found = (x, y, arc, *sums, value)
+            better = better & (score < BLOCKED)
+            kept = tuple(jnp.where(better, a, b) for a, b in zip(found, kept, strict=True))
+        return ((x, y, c, s), arc, weight, cost, state, best, at_step, held, sums, kept), None
 
     m = start.motion
     # the scan keeps the heading at mid-step: the first half turn starts from a standing turn rate of zero
-    half = -0.5 * dt * m.w
-    c0, s0 = rotate(m.c, m.s, half)
-    m = m._replace(c=c0, s=s0)
-    best = (jnp.full_like(zero, BLOCKED), m.x, m.y, zero, jnp.full_like(zero, BLOCKED), zero, zero, zero, zero)
-    alive = jnp.ones_like(start.v, dtype=bool)
-    carry = (m, zero, zero, zero, start.turned, alive, ~alive, best)
-    steps = jnp.arange(1, num_steps + 1, dtype=jnp.float32)
-    (_, _, _, _, _, _, hit, best), _ = jax.lax.scan(step, carry, steps)
-    score, x, y, arc, geometric, risk_sum, cost, turned, value = best
-    free = score < BLOCKED
-    collision = params.collision * hit.astype(jnp.float32)
-    extra = collision + start.bias
-    scores = Scores(
-        score=jnp.where(free, score + extra, BLOCKED), x=x, y=y, arc=arc,
-        geometric=jnp.where(free, geometric + extra, BLOCKED), exposure=risk_sum,
+    c0, s0 = rotate(m.c, m.s, -0.5 * dt * w0)
+    sums, kept = ((zero, zero, start.turned), (x0, y0) + (zero,) * 5) if detailed else ((), ())
+    carry = (
+        (x0, y0, c0, s0), zero, zero + 1.0, params.smoothness * start.turned, jnp.where(reach > 0, _GOING, _ENDED),
+        zero + BLOCKED, zero, (zero, zero, zero, reader.locate(field, x0, y0), zero, zero), sums, kept,
     )  # fmt: skip
-    terms = Terms(
-        collision=collision, clearance=params.clearance * cost, smoothness=params.smoothness * turned,
-        range_bias=params.range_bias * jnp.maximum(params.range_min - arc, 0.0),
-        progress=params.progress * (value + arc), exposure=params.risk_weight * risk_sum, bias=start.bias,
-    )  # fmt: skip
-    return scores, terms
+    carry, _ = jax.lax.scan(step, carry, (k, gain, least, blocked_below))
+    *_, state, best, at_step, held, _, kept = carry
+    # what is held must be a result of the loop, or it is not stored, but computed anew wherever the body uses it
+    finite = [a.astype(jnp.float32) > -jnp.inf for a in jax.tree.leaves(held)]
+    free = functools.reduce(jnp.logical_and, finite, best < BLOCKED)
+    collision = params.collision * (state == _HIT).astype(jnp.float32)
+    score = jnp.where(free, best + (collision + start.bias), BLOCKED)
+    return Scores(score=score, step=jnp.where(free, at_step, 0.0).astype(jnp.int32)), collision, kept
 
 
 @partial(jax.jit, static_argnames=("dt", "num_steps", "block_size", "reader"))
@@ -174,8 +228,8 @@ def score(
     *,
     dt: float,
     num_steps: int,
-    block_size: int = 8192,
-    reader: Callable[[Any, Array, Array], tuple[Array, Array, Array]] = look_up,
+    block_size: int | None = None,
+    reader: Reader = PACKED,
 ) -> Scores:
     """Roll out K candidates and score them (module docstring).
 
@@ -186,35 +240,88 @@ def score(
         robot: Radius and limits.
         dt: Step of the rollout [s].
         num_steps: T, steps rolled out; `params.horizon` masks what lies beyond it.
-        block_size: Candidates worked on at a time.
+        block_size: Candidates worked on at a time; None = what suits the device.
         reader: How `field` is read at (x, y): clearance, risk, value. Another one may read other layers.
     """
-    return _blocks(partial(reader, field), candidates, params, robot, dt, num_steps, block_size)[0]
-
-
-@partial(jax.jit, static_argnames=("dt", "num_steps"))
-def explain(
-    field: GridMap, candidates: Candidates, params: ScoreParams, robot: RobotParams, *, dt: float, num_steps: int
-) -> Terms:
-    """The terms of the scores of K (few) candidates; arguments as in `score`."""
-    return _blocks(partial(look_up, field), candidates, params, robot, dt, num_steps, candidates.v.shape[0])[1]
-
-
-def _blocks(
-    read: Reader, candidates: Candidates, params: ScoreParams, robot: RobotParams, dt: float, num: int, size: int
-) -> tuple[Scores, Terms]:
+    size = block_size or BLOCK_SIZE.get(jax.default_backend(), _MANY)
     count = candidates.v.shape[0]
-    # a robot that stands closer than the margin may leave: nothing blocks it but coming closer still
-    near, _, _ = read(candidates.motion.x[:1], candidates.motion.y[:1])
-    block = jnp.minimum(robot.radius + params.margin, near[0] - costmap.CLEARANCE_STEP)
+    block = _block(reader, field, candidates, params, robot)
 
-    def run(part: Candidates) -> tuple[Scores, Terms]:
-        return _score_block(read, part, params, robot, block, dt, num)
+    def run(part: Candidates) -> Scores:
+        return _score_block(reader, field, part, params, robot, block, dt, num_steps, detailed=False)[0]
 
-    if count <= size or count % size:
+    if count <= size:
         return run(candidates)
-    parts = jax.tree.map(lambda a: a.reshape(-1, size), candidates)
-    return jax.tree.map(lambda a: a.reshape(-1), jax.lax.map(run, parts))
+    whole = count // size * size
+    first = jax.tree.map(lambda a: a[:whole].reshape(-1, size), candidates)
+    scores = jax.tree.map(lambda a: a.reshape(-1), jax.lax.map(run, first))
+    if whole == count:
+        return scores
+    rest = run(jax.tree.map(lambda a: a[whole:], candidates))
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scores, rest)
+
+
+@partial(jax.jit, static_argnames=("num", "dt", "num_steps", "block_size", "reader"))
+def _score_some(first: Array, field: Any, candidates: Candidates, *rest: Any, num: int, **static: Any) -> Scores:
+    """Scores of `num` candidates from the `first` on."""
+    some = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, first, num), candidates)
+    return score(field, some, *rest, **static)
+
+
+def score_on_threads(
+    field: Any, candidates: Candidates, params: ScoreParams, robot: RobotParams, *, workers: int = 2, **static: Any
+) -> Scores:
+    """`score`, shared by `workers` threads: for many candidates, and not inside jit. Scores do not depend on `workers`."""
+    count = candidates.v.shape[0]
+    num = -(-count // workers)
+    starts = [min(k * num, count - num) for k in range(workers)]  # the last may do some again
+
+    def work(first: int) -> Scores:
+        part = _score_some(jnp.int32(first), field, candidates, params, robot, num=num, **static)
+        return jax.block_until_ready(part)
+
+    with ThreadPoolExecutor(workers) as pool:
+        parts = list(pool.map(work, starts))
+    fresh = [k * num - first for k, first in enumerate(starts)]
+    return jax.tree.map(lambda *a: jnp.concatenate([v[f:] for f, v in zip(fresh, a, strict=True)]), *parts)
+
+
+@partial(jax.jit, static_argnames=("dt", "num_steps", "reader"))
+def explain(
+    field: Any,
+    candidates: Candidates,
+    params: ScoreParams,
+    robot: RobotParams,
+    *,
+    dt: float,
+    num_steps: int,
+    reader: Reader = PACKED,
+) -> tuple[Best, Terms]:
+    """Where the best prefixes of K (few) candidates end, and the terms of their scores; arguments as in `score`."""
+    block = _block(reader, field, candidates, params, robot)
+    scores, collision, (x, y, arc, lack, risk, turned, value) = _score_block(
+        reader, field, candidates, params, robot, block, dt, num_steps, detailed=True
+    )
+    origin, unit = reader.frame(field)
+    best = Best(
+        score=scores.score, x=origin[0] + x * unit, y=origin[1] + y * unit, arc=arc, exposure=risk,
+        geometric=jnp.where(scores.step > 0, scores.score - params.risk_weight * risk, BLOCKED),
+    )  # fmt: skip
+    terms = Terms(
+        collision=collision, clearance=params.clearance * lack, smoothness=params.smoothness * turned,
+        range_bias=params.range_bias * jnp.maximum(params.range_min - arc, 0.0),
+        progress=params.progress * (value + arc), exposure=params.risk_weight * risk, bias=candidates.bias,
+    )  # fmt: skip
+    return best, terms
+
+
+def _block(reader: Reader, field: Any, candidates: Candidates, params: ScoreParams, robot: RobotParams) -> Array:
+    """Clearance [m] below which a pose is blocked."""
+    origin, unit = reader.frame(field)
+    x, y = (candidates.motion.x[:1] - origin[0]) / unit, (candidates.motion.y[:1] - origin[1]) / unit
+    near, _, _ = reader.read(field, reader.locate(field, x, y))
+    # a robot that stands closer than the margin may leave: nothing blocks it but coming closer still
+    return jnp.minimum(robot.radius + params.margin, near[0] - costmap.CLEARANCE_STEP)
 
 
 def at(values: _Each, index: Array) -> _Each:

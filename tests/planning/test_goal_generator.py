@@ -84,12 +84,13 @@ def test_the_choice_is_the_least_score():
     occupied = rng.random(SHAPE) < 0.004
     occupied[30:50, 20:40] = False
     words = field(occupied, risk=ndimage.uniform_filter((rng.random(SHAPE) < 0.2).astype(float), 9))
-    _, scores = everything(words)
+    ways, scores = everything(words)
     best = int(jnp.argmin(scores.score))
+    path = scoring.path_of(scoring.at(ways, jnp.int32(best)), ROBOT, dt=SPEC.dt, num_steps=SPEC.num_steps)
     got = choose(words)
     assert int(got.index) == best and bool(got.valid)
     assert float(got.score) == pytest.approx(float(scores.score.min()), abs=1e-5)  # eq. 9; two programs may fuse apart
-    np.testing.assert_allclose(got.xy, [scores.x[best], scores.y[best]], atol=1e-5)
+    np.testing.assert_allclose(got.xy, path[int(scores.step[best]) - 1], atol=1e-5)
     assert float(got.geometric) + PARAMS.risk_weight * float(got.exposure) == pytest.approx(float(got.score), abs=1e-5)
     assert float(sum(got.terms)[0]) == pytest.approx(float(got.score), abs=1e-4)
 

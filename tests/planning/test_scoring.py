@@ -22,6 +22,7 @@ TOLERANCE = 1e-4  # [m] 40 float32 additions to scores of up to 20 m
 NUM = 150
 
 score = jax.jit(scoring.score.__wrapped__, static_argnames=("dt", "num_steps", "block_size", "reader"))
+explain = jax.jit(scoring.explain.__wrapped__, static_argnames=("dt", "num_steps", "reader"))
 
 
 def f32(values):
@@ -68,8 +69,12 @@ def one_of(candidates, k):
     }  # fmt: skip
 
 
-def run(field, candidates, params=PARAMS, **static):
-    return score(field, candidates, params, ROBOT, dt=DT, num_steps=STEPS, **static)
+def run(field, candidates, params=PARAMS, num_steps=STEPS, **static):
+    """Scores looked at (`Best`), after a check that the scores alone are the same."""
+    best, _ = explain(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps)
+    alone = score(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps, **static)
+    chex.assert_trees_all_close(alone.score, best.score, atol=1e-5)
+    return best._replace(score=alone.score)
 
 
 VARIANTS = [
@@ -188,7 +193,7 @@ def test_exposure_is_the_integral_along_the_path():
 def test_a_masked_horizon_is_a_shorter_rollout(horizon):
     field, candidates = world(6), population(6)
     masked = run(field, candidates, PARAMS._replace(horizon=horizon))
-    short = score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=round(horizon / DT))
+    short = run(field, candidates, num_steps=round(horizon / DT))
     chex.assert_trees_all_close(masked, short, atol=TOLERANCE)
     assert float(masked.arc.max()) <= 1.2 * horizon + TOLERANCE  # speeds up to 1.2 m/s
 
@@ -205,12 +210,12 @@ def test_ends_lie_within_the_ranges():
 def test_the_terms_add_up_to_the_score():
     field, candidates = world(8), population(8)
     got = run(field, candidates)
-    terms = scoring.explain(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
+    _, terms = explain(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
     free = np.asarray(got.score) < BLOCKED
     np.testing.assert_allclose(np.asarray(sum(terms))[free], np.asarray(got.score)[free], atol=TOLERANCE)
     assert all(float(jnp.abs(t).max()) > 0 for t in terms)
     best = int(jnp.argmin(got.score))
-    alone = scoring.explain(field, scoring.at(candidates, jnp.int32(best)), PARAMS, ROBOT, dt=DT, num_steps=STEPS)
+    _, alone = explain(field, scoring.at(candidates, jnp.int32(best)), PARAMS, ROBOT, dt=DT, num_steps=STEPS)
     assert float(sum(alone)[0]) == pytest.approx(float(got.score[best]), abs=TOLERANCE)
 
 
@@ -218,6 +223,64 @@ def test_the_terms_add_up_to_the_score():
 def test_the_size_of_blocks_changes_nothing(size):
     field, candidates = world(9), population(9)
     chex.assert_trees_all_close(run(field, candidates, block_size=size), run(field, candidates), atol=1e-6)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_the_number_of_threads_changes_nothing(workers):
+    field, candidates = world(9), population(9)
+    how = {"dt": DT, "num_steps": STEPS}
+    shared = scoring.score_on_threads(field, candidates, PARAMS, ROBOT, workers=workers, **how)
+    chex.assert_trees_all_close(shared, score(field, candidates, PARAMS, ROBOT, **how), atol=1e-6)
+
+
+def test_the_step_leads_to_the_end():
+    field, candidates = world(12), population(12)
+    got, alone = run(field, candidates), score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
+    free = 0
+    for k in range(NUM):
+        if float(got.score[k]) == BLOCKED:
+            assert int(alone.step[k]) == 0
+            continue
+        free += 1
+        path = scoring.path_of(scoring.at(candidates, jnp.int32(k)), ROBOT, dt=DT, num_steps=STEPS)
+        np.testing.assert_allclose(path[int(alone.step[k]) - 1], [got.x[k], got.y[k]], atol=1e-5)
+    assert 0.2 * NUM < free < NUM
+
+
+@pytest.mark.parametrize("decay", [0.0, 40.0, 3e4])
+def test_any_discount_is_exact(decay):
+    """The discount is a product of factors that are ramps themselves; at 3e4 / m all that matters underflows."""
+    params, field, candidates = PARAMS._replace(decay=decay, risk_weight=9.0), world(13), population(13)
+    got = run(field, candidates, params)
+    layers = [np.asarray(a, np.float64) for a in costmap.unpack(field.values)]
+    block, compared = ROBOT.radius + params.margin, 0
+    for k in range(NUM):
+        want, certainty = reference.score(
+            layers, ORIGIN, RESOLUTION, one_of(candidates, k), params, ROBOT, DT, STEPS, block, STANDING_SPEED
+        )
+        if want is not None and certainty >= PLACE:
+            compared += 1
+            assert float(got.score[k]) == pytest.approx(want["score"], abs=TOLERANCE)
+    assert compared > 0.2 * NUM
+
+
+def test_another_reader_may_read_other_layers():
+    """Float layers in metres, looked up like packed words, give the same scores up to the packing's steps."""
+    field, candidates = world(14), population(14)
+    layers = costmap.unpack(field.values)
+
+    def locate(layers, x, y):
+        col = jnp.clip((x - ORIGIN[0]) / RESOLUTION, 0.0, SHAPE[1] - 1.0).astype(jnp.int32)
+        row = jnp.clip((y - ORIGIN[1]) / RESOLUTION, 0.0, SHAPE[0] - 1.0).astype(jnp.int32)
+        return row, col
+
+    reader = scoring.Reader(
+        lambda layers: (jnp.zeros(2, jnp.float32), 1.0), locate, lambda layers, at: tuple(a[at] for a in layers)
+    )
+    got = score(layers, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS, reader=reader)
+    want = score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
+    error = np.abs(np.asarray(got.score) - np.asarray(want.score))
+    assert np.mean(error > TOLERANCE) < 0.02  # poses on a border between cells
 
 
 def test_the_path_ends_where_the_score_says():
@@ -240,7 +303,9 @@ def test_one_trace_for_a_sweep_over_weights():
         params = PARAMS._replace(risk_weight=f32(k), decay=f32(0.1 * k), horizon=f32(4 - k), range_max=f32(5 - k))
         seen.add(float(once(world(k), population(k), params, ROBOT, dt=DT, num_steps=STEPS).score[5]))
     assert len(seen) == 3
-    sweep = jax.vmap(lambda lam: run(world(1), population(1), PARAMS._replace(risk_weight=lam)).score)(f32([0, 1, 4]))
+    score_of = lambda lam: score(  # noqa: E731
+        world(1), population(1), PARAMS._replace(risk_weight=lam), ROBOT, dt=DT, num_steps=STEPS
+    ).score
+    sweep = jax.vmap(score_of)(f32([0, 1, 4]))
     for lam, row in zip((0.0, 1.0, 4.0), sweep, strict=True):
-        one = run(world(1), population(1), PARAMS._replace(risk_weight=lam)).score
-        chex.assert_trees_all_close(row, one, atol=1e-5)
+        chex.assert_trees_all_close(row, score_of(f32(lam)), atol=1e-5)
