@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from drnav_jax import bench
+from drnav_jax import bench, bench_planning
 from drnav_jax.planning import scoring
 
 
@@ -54,10 +54,10 @@ def test_packed_words_score_almost_like_float_layers(result):
 
 def test_difference_is_that_of_the_scores():
     free = np.asarray([2.0, 4.0, 3.0])
-    one = bench._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([1.5, 1.0]))])
+    one = bench_planning._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([1.5, 1.0]))])
     assert one["candidates"] == 5 and one["blocked_in_one_only"] == one["choices_blocked"] == 0
     assert one["max_regret_m"] == 0.5 and one["median_rank_of_choice"] == 0.5
-    blocked = bench._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([scoring.BLOCKED, 1.0]))])
+    blocked = bench_planning._difference([(free, free), (np.asarray([1.0, 2.0]), np.asarray([scoring.BLOCKED, 1.0]))])
     assert blocked["blocked_in_one_only"] == 0.2 and blocked["choices_blocked"] == 1
 
 

@@ -25,6 +25,7 @@ RANKS = {
     "train": 3,
     "bench": 3,
     "bench_sensors": 3,
+    "bench_planning": 3,
     "report": 3,
     "sources": 3,
     "navigator": 2,
@@ -40,7 +41,10 @@ RANKS = {
     "geometry": 0,
     "grids": 0,
 }
-SIDEWAYS = {("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors")}
+SIDEWAYS = {
+    ("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors"),
+    ("bench", "bench_planning"), ("bench_planning", "evaluate"), ("bench_planning", "bench_sensors"),
+}  # fmt: skip
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400
 # Heavy or talkative, and needed by one subpackage each, which imports them when it is used.

@@ -117,8 +117,8 @@ class Reader(NamedTuple):
     """How a field is read. The kernel counts x and y from the reader's origin, in the reader's unit."""
 
     frame: Callable[[Any], tuple[Array, Scalar]]  # field -> origin [m] `[2]`, unit [m]
-    locate: Callable[[Any, Array, Array], Any]  # (field, x, y) -> places: arrays of finite numbers
-    read: Callable[[Any, Any], tuple[Array, Array, Array]]  # (field, places) -> clearance [m], risk, value [m]
+    locate: Callable[[Any, Array, Array], Any]  # (field, x, y) -> places: arrays like x, of finite numbers
+    read: Callable[[Any, Any], tuple[Array, ...]]  # (field, places) -> clearance [m], risk, value [m]
 
 
 _Each = TypeVar("_Each", Candidates, Scores, Best, Terms)
