@@ -115,12 +115,11 @@ def _opaque(spans: Spans, opaque: Array, slope: Array, reach: Array) -> Array:
         return jnp.minimum(met, jnp.where(first < last, first, jnp.inf))
 
     met = jnp.minimum(sides[None, :], caps[:, None])
-    ahead = opaque & jnp.any((entry < spans.leave) & (entry <= reach), axis=1)
-    return jnp.maximum(each(ahead, nearer, met), 0.0)
+    return jnp.maximum(each(opaque & (spans.near <= reach), nearer, met), 0.0)
 
 
 def _veiled(
-    spans: Spans, veils: Array, extinction: Array, slope: Array, cos: Array, met: Array, word: Array | None
+    spans: Spans, veils: Array, extinction: Array, slope: Array, cos: Array, reach: Array, met: Array, word: Array | None
 ) -> Array:
     """`met` `[rings, A]`, or less where a beam returns from a veil before it.
 
@@ -138,7 +137,7 @@ def _veiled(
             at = first + length * cos[:, None]
         return jnp.where((at < last) & (first < last), jnp.minimum(met, at), met)
 
-    return each(veils & jnp.any(spans.entry < spans.leave, axis=1), nearer, met)
+    return each(veils & (spans.near <= reach), nearer, met)
 
 
 def _uniform(word: Array, n: Array) -> Array:
@@ -158,6 +157,7 @@ def _trace(
     slope, cos = np.tan(spec.elevations), np.cos(spec.elevations)
     slope, cos = _f32(np.where(np.abs(slope) < 1e-9, 1e-9, slope)), _f32(cos)
     reach, shape = _f32(params.max_range) * cos, (spec.rings, spec.azimuths)
+    far = jnp.max(reach)  # horizontally
     c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
     along_x, along_y = _f32(np.cos(spec.bearings)), _f32(np.sin(spec.bearings))
     dx, dy = c * along_x - s * along_y, s * along_x + c * along_y
@@ -181,11 +181,11 @@ def _trace(
             return spans.entry[n][None, :], spans.leave[n][None, :]
 
         end, _ = down_drops(jnp.broadcast_to(ground, shape), drops, footprint, floor)
-        met = jnp.minimum(jnp.minimum(end, ceiling), _opaque(spans, opaque, slope, jnp.max(reach)))
+        met = jnp.minimum(jnp.minimum(end, ceiling), _opaque(spans, opaque, slope, far))
         if veils:
-            met = _veiled(spans, veiling, jnp.asarray(EXTINCTION)[material], slope, cos, met, word)
+            met = _veiled(spans, veiling, jnp.asarray(EXTINCTION)[material], slope, cos, far, met, word)
     if world.field.values.size:
-        wall = wall_distance(jax.tree.map(_f32, world.field), pose[:2], dx, dy, jnp.max(reach))[None, :]
+        wall = wall_distance(jax.tree.map(_f32, world.field), pose[:2], dx, dy, far)[None, :]
         over = height + wall * slope[:, None] > WALL_HEIGHT
         met = jnp.minimum(met, jnp.where(over, jnp.inf, wall))
     met = jnp.broadcast_to(met, shape)

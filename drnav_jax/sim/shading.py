@@ -146,12 +146,12 @@ def _sky(scenery: Scenery, up: Array) -> tuple[Colour, Colour]:
 
 def surface_colour(world: World, table: Array, rays: Rays, hits: Hits) -> Colour:
     """Colour of the first opaque surfaces, `[h, w]` for each channel."""
-    scenery, rows = world.scenery, once(table[hits.n])
+    scenery, rows = world.scenery, once(jnp.take(table.T, hits.n, axis=1, mode="clip"))
     sky = jnp.isinf(hits.depth)
     depth = jnp.where(sky, 1.0, hits.depth)
 
     def row(k: int) -> Array:
-        return rows[..., k]
+        return rows[k]
 
     length = jnp.sqrt(rays.dx * rays.dx + rays.dy * rays.dy + rays.dz * rays.dz)
     at = _point(row, rays, depth)
@@ -165,21 +165,22 @@ def surface_colour(world: World, table: Array, rays: Rays, hits: Hits) -> Colour
     lit = scenery.ambient + (1 - scenery.ambient) * jnp.maximum(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
     lit = jnp.where(row(_MATERIAL) == CEILING, scenery.ambient + 0.3 + 0.4 * light, lit)  # lamps light it from below
     corner = jnp.where(face.upright, 0.72 + 0.28 * jnp.clip(at.z / 0.4, 0.0, 1.0), 1.0)
-    lit = WHITE * lit * corner * jnp.exp(1.1 * jnp.minimum(at.z, 0.0))
     up = rays.dz / length
+    clear = jnp.exp(-(scenery.fog + HAZE) * depth * length)
+    lit, clear = once((WHITE * lit * corner * jnp.exp(1.1 * jnp.minimum(at.z, 0.0)), clear))
     above, air = _sky(scenery, up)
     mirror = 0.3 + 0.6 * jnp.clip(0.5 + 4.0 * up, 0.0, 1.0)
     own = _mix((own[0] * lit, own[1] * lit, own[2] * lit), (mirror, mirror, mirror), row(_LOOK + 12) * (1 - light))
-    own = _mix(air, own, jnp.exp(-(scenery.fog + HAZE) * depth * length))
+    own = _mix(air, own, clear)
     return _mix(own, above, sky.astype(jnp.float32))
 
 
 def veil_colour(world: World, table: Array, rays: Rays, veil: Veil, behind: Array, under: Colour) -> Colour:
     """What a veil makes of the colour behind it, whose surface lies at a depth."""
-    scenery, rows = world.scenery, once(table[veil.n])
+    scenery, rows = world.scenery, once(jnp.take(table.T, veil.n, axis=1, mode="clip"))
 
     def row(k: int) -> Array:
-        return rows[..., k]
+        return rows[k]
 
     seen = veil.depth < behind
     depth = jnp.where(seen, veil.depth, 1.0)

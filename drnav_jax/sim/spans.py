@@ -35,6 +35,7 @@ class Spans(NamedTuple):
     entry: Array  # [N, A]
     leave: Array  # [N, A]
     within: Array  # [N] whether the sensor is in the footprint
+    near: Array  # [N] the footprint is at least this far from the sensor [m]
     low: Array  # [N] bottom, relative to the sensor [m]
     high: Array  # [N] top
 
@@ -56,6 +57,7 @@ def box_spans(boxes: Array, height: Array, pose: Array, dx: Array, dy: Array) ->
         entry=jnp.maximum(*entry),
         leave=jnp.minimum(*leave),
         within=within[0] & within[1],
+        near=jnp.hypot(rx, ry) - jnp.hypot(boxes[:, 3], boxes[:, 4]),
         low=boxes[:, 5] - height,
         high=boxes[:, 6] - height,
     )
@@ -72,6 +74,7 @@ def cylinder_spans(cylinders: Array, height: Array, pose: Array, dx: Array, dy: 
         entry=along - half,
         leave=along + half,
         within=rx * rx + ry * ry < r * r,
+        near=jnp.hypot(rx, ry) - r,
         low=cylinders[:, 3] - height,
         high=cylinders[:, 4] - height,
     )
