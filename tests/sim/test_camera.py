@@ -19,7 +19,7 @@ TILTED = (Mount(pitch=0.35), Mount(yaw=2.0, pitch=0.3, roll=0.2), Mount(yaw=-1.5
 ROUNDING = 2e-4  # [] of a depth in float32: the ray, the hit and the difference of two of them
 ORIGIN = np.zeros(3, np.float32)
 NUM = 12  # boxes of a test's world, so that all are one program
-SMALL = RigSpec((Mount(),), shape=(24, 32))
+SMALL, LARGE = (RigSpec((Mount(),), shape=shape) for shape in ((24, 32), (96, 96)))
 QUIET = sim.CameraParams(noise_std=0.0, exposure_jitter=0.0, white_jitter=0.0, vignette=0.0)
 
 
@@ -131,12 +131,10 @@ def test_a_map_s_walls_are_met_and_passed_over():
 
 
 def test_a_level_rig_is_a_tilted_one_without_tilt():
-    spec = RigSpec(FRONT_LEFT_RIGHT, shape=(24, 32))
     for veils in (False, True):
-        a, b = (depth(MIXED, spec, level=level, veils=veils) for level in (True, False))
-        near = np.isclose(a, b, rtol=ROUNDING)
-        assert near.mean() > 0.998
-    a, b = (image(MIXED, spec, level=level) for level in (True, False))
+        a, b = (depth(MIXED, level=level, veils=veils) for level in (True, False))
+        assert np.isclose(a, b, rtol=ROUNDING).mean() > 0.998
+    a, b = (image(MIXED, level=level) for level in (True, False))
     assert np.mean(np.abs(a - b) > 0.02) < 0.01  # pixels on an edge
 
 
@@ -150,18 +148,17 @@ def test_images_are_numbers_between_black_and_white_and_follow_the_key():
 
 
 def test_the_sensor_has_the_stated_noise_gain_and_blur():
-    spec = RigSpec((Mount(pitch=-1.3),), shape=(64, 64))  # the sky
     world = world_of(sky_colour=(0.5, 0.5, 0.5), exposure=0.8)
-    plain = image(world, spec)[0]
-    noisy = image(world, spec, QUIET._replace(noise_std=0.02))[0] - plain
-    # 12,288 samples: the standard error of the spread is 0.7 %; the noise at this light is 0.02 (0.5 + light)
+    plain = image(world, LARGE)[0, :48]  # the sky
+    noisy = image(world, LARGE, QUIET._replace(noise_std=0.02))[0, :48] - plain
+    # 13,824 samples: the standard error of the spread is 0.7 %; the noise at this light is 0.02 (0.5 + light)
     assert abs(np.std(noisy / (0.5 + plain)) / 0.02 - 1) < 0.03 and abs(noisy.mean()) < 1e-3
     assert abs(np.corrcoef(noisy[..., 0].ravel(), noisy[..., 1].ravel())[0, 1]) < 0.05
-    np.testing.assert_allclose(plain[32, 32], 0.4, atol=0.01)
-    gains = [image(world, spec, QUIET._replace(exposure_jitter=0.1), seed=k)[0, 32, 32, 0] / 0.4 for k in range(40)]
+    np.testing.assert_allclose(plain[0, 48], 0.4, atol=0.01)
+    gains = [image(world, LARGE, QUIET._replace(exposure_jitter=0.1), seed=k)[0, 0, 48, 0] / 0.4 for k in range(40)]
     assert 0.06 < np.std(gains) < 0.14
-    dim = image(world, spec, QUIET._replace(vignette=0.5))[0] / plain
-    np.testing.assert_allclose([dim[0, 0, 0], dim[32, 32, 0]], [0.5, 1.0], atol=0.01)
+    dim = image(world, LARGE, QUIET._replace(vignette=0.5))[0, :48] / plain
+    np.testing.assert_allclose([dim[0, 0, 0], dim[47, 48, 0]], [0.5, 1.0], atol=0.01)
     edge = world_of(block(2.0, 4.0, 0.1, 4.0, 9.0, colour=(0.0, 0.0, 0.0)))
     sharp, soft = (image(edge, params=QUIET._replace(blur=b))[0, 4, :, 2] for b in (0.0, 0.25))
     expected = 0.5 * sharp[1:-1] + 0.25 * (sharp[2:] + sharp[:-2])
@@ -185,9 +182,9 @@ def test_plants_have_ragged_edges_and_grass_lets_light_through():
     shares = {}
     for material in (Material.BUSH, Material.GRASS):
         plant = block(3.0, 0.0, 0.6, 1.5, 0.9, material, (0.2, 0.5, 0.1))
-        world, spec = world_of(back, plant), RigSpec((Mount(),), shape=(96, 96))
-        a = image(world, spec)[0]
-        within = depth(world, spec, veils=True)[0] < 4
+        world = world_of(back, plant)
+        a = image(world, LARGE)[0]
+        within = depth(world, LARGE, veils=True)[0] < 4
         seen = (a[..., 2] > a[..., 1]) & within  # of the back wall
         middle = np.zeros_like(within)
         middle[45:56, 30:66] = True
@@ -200,8 +197,7 @@ def test_plants_have_ragged_edges_and_grass_lets_light_through():
 def test_stripes_lie_on_the_ground_and_a_drop_is_darker_than_the_floor():
     stripe = block(1.5, 0.0, 0.5, 2.0, 0.0, Material.STRIPE, (0.95, 0.8, 0.1))
     drop = block(3.5, 0.0, 1.5, 9.0, 0.0, Material.DROP, (0.5, 0.5, 0.5), low=-1.5)
-    spec = RigSpec((Mount(),), shape=(96, 96))
-    bare, striped, open_ = (image(world_of(*solids), spec)[0] for solids in ((), (stripe,), (drop,)))
+    bare, striped, open_ = (image(world_of(*solids), LARGE)[0] for solids in ((), (stripe,), (drop,)))
     yellow = striped[..., 0] - striped[..., 2] > 0.3
     assert 0.3 < yellow[61:70, 20:76].mean() < 0.7 and not yellow[:58].any() and not yellow[75:].any()
     changed = np.abs(bare - open_).max(axis=-1) > 0.02
@@ -221,14 +217,13 @@ def test_fog_hides_what_is_far_and_walls_have_their_colour():
 def test_each_material_has_a_texture_of_its_own(material):
     ground = dict(ground_material=int(Material.CONCRETE), ground_colour=(0.0, 0.0, 0.0))
     solid = block(2.0, 0.0, 0.3, 1.4, 2.2, material, (0.6, 0.5, 0.4))
-    spec = RigSpec((Mount(),), shape=(96, 96))
-    a = image(world_of(solid, **ground), spec)[0]
-    reference = image(world_of(block(2.0, 0.0, 0.3, 1.4, 2.2, Material.WALL, (0.6, 0.5, 0.4)), **ground), spec)[0]
+    a = image(world_of(solid, **ground), LARGE)[0]
+    reference = image(world_of(block(2.0, 0.0, 0.3, 1.4, 2.2, Material.WALL, (0.6, 0.5, 0.4)), **ground), LARGE)[0]
     if material == Material.WALL:
         assert 0 < np.std(a[20:60, 30:66, 0]) < 0.05
     else:
         assert np.abs(a - reference).mean() > 0.005
-    other = image(world_of(solid, texture_seed=5, **ground), spec)[0]
+    other = image(world_of(solid, texture_seed=5, **ground), LARGE)[0]
     assert material == Material.CAR or not np.array_equal(a, other)  # paint has no grain
 
 
