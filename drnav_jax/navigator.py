@@ -2,7 +2,8 @@
 
     perceive   sensors -> filter: occupancy, and (when replanning) the predictor's dead-end evidence     (eq. 4-6)
     replan     filter -> risk P_dead^foot, cost-to-go, recovery points; every 5th tick
-    act        goal generator (eq. 7-9) -> g* -> DWA with a braking certificate -> command
+    act        goal generator (eq. 7-9) -> g* -> DWA with a braking certificate -> command;
+               or, for the rivals, a path followed by DWB or MPPI (`planning.follower`)
 
 This is the one place that joins models, filter and planning. Nothing branches on values in Python, nothing raises inside:
 broken sensor values are masked, a broken pose stops the robot, and every command is finite and within the limits.
@@ -23,9 +24,10 @@ from drnav_jax.filter import recovery as recovery_points
 from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
 from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
 from drnav_jax.models import geometric
-from drnav_jax.planning import costmap, dynamics, goal_generator, memory, route, tracker
+from drnav_jax.planning import costmap, dynamics, follower, goal_generator, memory, nav2_recovery, route, tracker
 from drnav_jax.planning import recovery as behaviour
 from drnav_jax.planning.compositions import Composition
+from drnav_jax.planning.follower import Explained, FollowerParams, FollowerSpec, FollowerState
 from drnav_jax.planning.goal_generator import GeneratorSpec, LocalGoal
 from drnav_jax.planning.memory import MemorySpec, MemoryState
 from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
@@ -52,6 +54,7 @@ class NavSpec:
         route: Resolution of the cost-to-go.
         recovery_points: Capacity of the recovery points' store.
         memory: What the route remembers beyond the window.
+        follower: DWB and MPPI.
         dt: Tick [s].
         replan_every: Ticks per replan.
     """
@@ -64,6 +67,7 @@ class NavSpec:
     route: RouteSpec = RouteSpec()
     recovery_points: RecoverySpec = RecoverySpec()
     memory: MemorySpec = MemorySpec()
+    follower: FollowerSpec = FollowerSpec()
     dt: float = 0.1
     replan_every: int = 5
 
@@ -75,6 +79,8 @@ class NavSpec:
         memory.check(self.memory, self.filter.grid)
         if self.dt <= 0 or self.replan_every < 1:
             raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
+        if self.planner.tracker == "mppi" and abs(self.follower.mppi.dt - self.dt) > 1e-6:
+            raise ValueError(f"MPPI's step must be the tick, {self.dt} s: follower.mppi.dt is {self.follower.mppi.dt}.")
         if not self.planner.controls and self.generator.num_speeds:
             object.__setattr__(self, "generator", dataclasses.replace(self.generator, num_speeds=0))
 
@@ -89,6 +95,7 @@ class NavParams(NamedTuple):
     tracker: TrackerParams = TrackerParams()
     recovery: RecoveryParams = RecoveryParams()
     recovery_points: RecoveryPointParams = RecoveryPointParams()
+    follower: FollowerParams = FollowerParams()
     predictor: Any = geometric.GeometricParams()
     squeeze_time: Scalar = 5.0  # [] how long narrow ways stay allowed after none was found [s]
     hysteresis: Scalar = 0.3  # [] advantage of the last g* [m]
@@ -107,6 +114,7 @@ class NavState(NamedTuple):
     points: RecoveryPoints
     memory: MemoryState
     recovery: RecoveryState
+    follower: FollowerState | None  # of planners that follow a path
     local_goal: Array  # [2] the last g* [m]
     last_pose: Array  # [3] the last finite pose
     last_command: Array  # [2] v, omega
@@ -124,6 +132,7 @@ class Info(NamedTuple):
     p_dead: Array  # [] P_dead under the robot
     clearance: Array  # [] clearance as the map has it [m]
     fault: Array  # [] bool: pose not finite or leapt, or no valid scan
+    critics: Explained | None  # of DWB or MPPI
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -146,6 +155,7 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
         points=recovery_points.init(spec.recovery_points),
         memory=memory.init(spec.memory),
         recovery=behaviour.init(spec.filter.grid, pose[:2]),
+        follower=follower.init(spec.follower, spec.planner, params.follower, pose),
         local_goal=pose[:2],
         last_pose=pose,
         last_command=jnp.zeros(2, jnp.float32),
@@ -233,7 +243,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
     remembered = state.memory
     retreating = recover.mode == behaviour.RETREAT
-    if planner.recovery:
+    if planner.recovery == "drnav":
         x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
         here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
         room = local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here)
@@ -242,7 +252,8 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
             grids.flood_fill(room, here), state.time,
         )  # fmt: skip
         goal = jnp.where(retreating, recover.target, goal)
-    if planner.needs_route or planner.recovery:
+    found = None
+    if planner.needs_route or planner.recovery == "drnav":
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
         squeeze = state.time < state.squeeze_until
         margin = jnp.where(squeeze, params.route.squeeze_margin, params.route.closed_margin)
@@ -266,14 +277,20 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         value, reachable = jnp.where(retreating, value, direct), reachable | ~retreating
         exposed = jnp.maximum(risk, visits)  # no route that visits could be priced in: they count as exposure
     exposed = exposed if planner.exposure else nothing
+    following = state.follower
+    if following is not None:
+        following = follower.replan(
+            spec.follower, planner, following, found, local.origin, grid.resolution * spec.route.pooling, seen.pose[:2],
+            goal, state.time,
+        )  # fmt: skip
     return state._replace(
         belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, squeeze_until=until,
-        points=points, memory=remembered,
+        points=points, memory=remembered, follower=following,
     )
 
 
 def _act(
-    spec: NavSpec, params: NavParams, state: NavState, seen: Observation, healthy: Array, leap: Array
+    spec: NavSpec, params: NavParams, state: NavState, seen: Observation, healthy: Array, leap: Array, key: PRNGKeyArray
 ) -> tuple[NavState, Command, Info]:
     """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
@@ -294,7 +311,7 @@ def _act(
         )  # fmt: skip
     else:
         choice = goal_generator.given(seen.goal)
-    if planner.recovery:
+    if planner.recovery == "drnav":
         visited = GridMap(recover.visits, window.origin, grid.resolution)
         points = state.points
         refuge, has_refuge = behaviour.choose(
@@ -306,26 +323,44 @@ def _act(
             choice.valid, state.reachable,
             refuge, has_refuge,
         )  # fmt: skip
-    track = tracker.track(
-        spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, recover.mode == behaviour.CLEAR
-    )
-    halt = arrived | ~healthy | (recover.mode == behaviour.STOP)
+    seek_room, critics = recover.mode == behaviour.CLEAR, None
+    following: Any = state.follower
+    track = tracker.track(spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, seek_room)
+    if planner.follows:
+        n, (top, left) = spec.filter.local_cells, belief.local_corner(spec.filter)
+        risk = grids.repeat(state.risk[top : top + n, left : left + n], 2)
+        following, followed, critics = follower.act(
+            spec.follower, planner, params.follower, robot, following, local, risk, pose, twist, heading_for, spec.dt, key
+        )
+        track = jax.tree.map(lambda a, b: jnp.where(seek_room, a, b), track, followed)
+    held, mode, entries = state.belief, recover.mode, recover.entries
+    if planner.recovery == "nav2":
+        waiting = arrived | ~healthy
+        following, track, wipe = follower.recover(
+            params.follower, robot, following, local, track, pose, twist, time, waiting, spec.dt
+        )
+        held = belief.forget(spec.filter, held, pose[:2], jnp.where(wipe, params.follower.recovery.clear_radius, -1.0))
+        mode, entries = nav2_recovery.as_drnav(following.recovery.mode), following.recovery.retries
+    halt = arrived | ~healthy | (mode == behaviour.STOP)
     stop = dynamics.limit(0.0, 0.0, twist, robot, spec.dt)
     command = jax.tree.map(lambda a, b: jnp.where(halt, a, b), stop, track.command)
     info = Info(
         local_goal=choice,
         track=track,
-        mode=recover.mode,
+        mode=mode,
         arrived=arrived,
-        recoveries=recover.entries,
+        recoveries=entries,
         p_dead=dead_end.probability(
             geometry.sample_nearest(GridMap(state.belief.dead_end, window.origin, grid.resolution), pose[:2])
         ),
         clearance=geometry.sample_bilinear(local, pose[:2]),
         fault=~healthy | leap | ~jnp.any(seen.point_valid),
+        critics=critics,
     )
     state = state._replace(
+        belief=held,
         recovery=recover,
+        follower=following,
         local_goal=choice.xy,
         last_pose=pose,
         last_command=jnp.stack([command.v, command.omega]),
@@ -345,16 +380,15 @@ def step(
         params: Parameters; sweep them without compiling again.
         state: What the robot carried over.
         observation: What its sensors say now; missing sensors are masked, non-finite values count as missing.
-        key: Randomness (the DWA planners use none).
+        key: Randomness (only MPPI uses any).
         replan: Also update the dead-end belief, the cost-to-go and the recovery points; every
             `spec.replan_every`-th tick, the first included (static).
 
     Returns:
         The new state, the command (finite, within speed and acceleration limits) and what one looks at.
     """
-    del key
     seen, healthy, leap = _sane(params, state, observation)
     state = _perceive(spec, params, state, seen, leap)
     if replan:
         state = _replan(spec, params, state, seen)
-    return _act(spec, params, state, seen, healthy, leap)
+    return _act(spec, params, state, seen, healthy, leap, key)

@@ -119,6 +119,20 @@ def local_map(spec: FilterSpec, state: FilterState) -> LocalMap:
     )
 
 
+def forget(spec: FilterSpec, state: FilterState, xy: Float[Array, "2"], radius: Scalar) -> FilterState:
+    """Forget the obstacles in a square of half edge `radius` [m] around `xy`, as Nav2 clears its costmaps."""
+    resolution = spec.grid.resolution
+    origin = geometry.window_origin(state.corner, spec.grid)
+    x, y = geometry.cell_centres(spec.grid.shape, origin, resolution)
+    near = jnp.maximum(jnp.abs(x - xy[0]), jnp.abs(y - xy[1])) <= radius
+    n, (top, left) = spec.local_cells, local_corner(spec)
+    fine = jnp.repeat(jnp.repeat(near[top : top + n, left : left + n], 2, axis=0), 2, axis=1)
+    return state._replace(
+        occupancy=jnp.where(near, 0.0, state.occupancy), seen=state.seen & ~near,
+        surface=jnp.where(fine, 0.0, state.surface),
+    )  # fmt: skip
+
+
 @partial(jax.jit, static_argnames="spec")
 def observe(
     spec: FilterSpec,

@@ -2,7 +2,11 @@
 
 `headings`, `controls`: the generator's candidates; with neither there is no generator and g* is the goal itself.
 `progress`: "cost_to_go" (by way) or "straight" (by air, the paper's). `risk_in_route`: cell cost 1 + lambda P_dead.
-`exposure`: lambda * EDE in the score (eq. 7). `recovery`: semantic recovery when stuck. All are tracked by the same DWA.
+`exposure`: lambda * EDE in the score (eq. 7), and as a critic of MPPI. `tracker`: "dwa" drives to g*; "dwb" and "mppi"
+follow a `path`: "straight" to the goal, or down the cost-to-go ("route"), made anew every `path_period` [s] (0: at every
+replan). `recovery` when stuck: "drnav" (semantic), "nav2" (round robin) or "none".
+
+`dwb` and `mppi` are the paper's rivals, without a global planner; `nav2-dwb` and `nav2-mppi` are how Nav2 is run.
 """
 
 import dataclasses
@@ -17,12 +21,23 @@ class Composition:
     progress: str = "cost_to_go"
     risk_in_route: bool = True
     exposure: bool = True
-    recovery: bool = True
+    recovery: str = "drnav"
+    tracker: str = "dwa"
+    path: str = "route"
+    path_period: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the combination."""
         if self.progress not in ("cost_to_go", "straight"):
             raise ValueError(f'progress must be "cost_to_go" or "straight", got "{self.progress}".')
+        parts = {"recovery": ("drnav", "nav2", "none"), "tracker": ("dwa", "dwb", "mppi"), "path": ("straight", "route")}
+        for part, choices in parts.items():
+            if getattr(self, part) not in choices:
+                raise ValueError(f'{part} must be one of {", ".join(choices)}, got "{getattr(self, part)}".')
+        if self.follows and self.path == "route" and self.progress != "cost_to_go":
+            raise ValueError('path="route" goes down the cost-to-go: set progress="cost_to_go".')
+        if self.path_period < 0:
+            raise ValueError(f"path_period must be >= 0 s, got {self.path_period}.")
         if self.controls and not self.headings:
             raise ValueError("controls without headings are not a generator: set headings=True.")
 
@@ -32,17 +47,31 @@ class Composition:
         return self.headings
 
     @property
+    def follows(self) -> bool:
+        """Whether the tracker follows a path."""
+        return self.tracker != "dwa"
+
+    @property
     def needs_route(self) -> bool:
         """Whether a cost-to-go is solved for the goal."""
-        return self.generates and self.progress == "cost_to_go"
+        return self.progress == "cost_to_go" and (self.generates or self.follows)
 
+
+_REACTIVE = Composition(
+    headings=False, controls=False, progress="straight", risk_in_route=False, exposure=False, recovery="none",
+    path="straight", path_period=1.0,
+)  # fmt: skip
+_NAV2 = dataclasses.replace(_REACTIVE, progress="cost_to_go", path="route", recovery="nav2", tracker="dwb")
 
 PLANNERS = {
     "drnav": Composition(),
     "drnav-straight": Composition(progress="straight", risk_in_route=False),
-    "dwa": Composition(
-        headings=False, controls=False, progress="straight", risk_in_route=False, exposure=False, recovery=False
-    ),
+    "drnav-mppi": Composition(tracker="mppi"),
+    "dwa": _REACTIVE,
+    "dwb": dataclasses.replace(_REACTIVE, tracker="dwb"),
+    "mppi": dataclasses.replace(_REACTIVE, tracker="mppi"),
+    "nav2-dwb": _NAV2,
+    "nav2-mppi": dataclasses.replace(_NAV2, tracker="mppi"),
     "grid": Composition(controls=False, risk_in_route=False, exposure=False),
     "grid+ede": Composition(controls=False, exposure=False),
 }

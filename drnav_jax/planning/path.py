@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drnav_jax import geometry, grids
+from drnav_jax.planning.route import Route
 from drnav_jax.types import Scalar
 
 
@@ -79,6 +81,53 @@ def resample(
     offset = index[None, :] - index[:, None]
     weight = jnp.where(jnp.abs(offset) <= reach[:, None], 1.0, 0.0) / (2 * reach[:, None] + 1).astype(jnp.float32)
     return _padded(path._replace(x=weight @ path.x, y=weight @ path.y))
+
+
+@partial(jax.jit, static_argnames=("num_moves", "num_points", "smoothing"))
+def down(
+    route: Route,
+    origin: Float[Array, "2"],
+    size: Scalar,
+    xy: Float[Array, "2"],
+    goal: Float[Array, "2"],
+    *,
+    num_moves: int,
+    spacing: Scalar,
+    num_points: int,
+    smoothing: int,
+) -> Path:
+    """The path from a robot down the cost-to-go.
+
+    Args:
+        route: As solved.
+        origin: Outer corner of its cell (0, 0) [m].
+        size: Edge of its cells [m].
+        xy: Robot [m].
+        goal: Where it leads to [m].
+        num_moves: Cells that it goes down at most.
+        spacing: Of its points [m].
+        num_points: N.
+        smoothing: As in `resample`.
+    """
+    h, w = route.coarse.shape
+    x, y = geometry.cell_centres((h, w), origin, size)
+    away = jnp.hypot(x - xy[0], y - xy[1])
+    # a robot that stands on a closed cell begins on the best of those beside it
+    own = jnp.clip(geometry.cell_of(xy, origin, size), 0, jnp.asarray([h - 1, w - 1], jnp.int32))
+    best = jnp.argmin(jnp.where(away < 2.0 * size, route.coarse + away, 2.0 * grids.UNREACHABLE))
+    other = jnp.stack([best // w, best % w]).astype(jnp.int32)
+    first = jnp.where(route.coarse[own[0], own[1]] < 0.5 * grids.UNREACHABLE, own, other)
+    cells, moved = grids.descend(
+        route.coarse, first, route.cost, resolution=size, num_steps=num_moves, east=route.east, north=route.north
+    )
+    centres = geometry.centre_of(cells, origin, size)
+    count = jnp.sum(moved.astype(jnp.int32))
+    last = jnp.where(count > 0, centres[jnp.maximum(count - 1, 0)], xy)
+    there = jnp.hypot(last[0] - goal[0], last[1] - goal[1]) <= 2.0 * size
+    points = jnp.concatenate([xy[None], centres, xy[None]])
+    points = points.at[count + 1].set(jnp.where(there, goal, points[count + 1]))
+    valid = jnp.arange(points.shape[0]) < count + 1 + there.astype(jnp.int32)
+    return resample(points, valid, spacing=spacing, num_points=num_points, smoothing=smoothing)
 
 
 @partial(jax.jit, static_argnames="num_points")

@@ -59,6 +59,10 @@ class Route(NamedTuple):
 
     value: Float[Array, "H W"]  # [m] on the map's cells; `UNREACHABLE` where there is no way
     reachable: Bool[Array, ""]  # the robot has a way (possibly out of the window) to the goal
+    coarse: Float[Array, "h w"]  # the value on the route's own cells [m]
+    cost: Float[Array, "h w"]  # what leaving each of them costs per metre
+    east: Bool[Array, "h w"]  # one can pass to the cell at higher x
+    north: Bool[Array, "h w"]  # one can pass to the cell at higher y
 
 
 def _spread(value: Array, by: int) -> Array:
@@ -146,7 +150,10 @@ def solve(
         cost, initial, resolution=size, east=east, north=north, max_iterations=spec.max_iterations
     )
     nearby = jnp.where(to_robot < 2.0 * size, value, grids.UNREACHABLE)
-    return Route(value=_spread(value, by), reachable=jnp.min(nearby) < 0.5 * grids.UNREACHABLE)
+    return Route(
+        value=_spread(value, by), reachable=jnp.min(nearby) < 0.5 * grids.UNREACHABLE, coarse=value, cost=cost, east=east,
+        north=north,
+    )  # fmt: skip
 
 
 def straight(
