@@ -256,7 +256,8 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     if planner.needs_route or planner.recovery == "drnav":
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
         squeeze = state.time < state.squeeze_until
-        margin = jnp.where(squeeze, params.route.squeeze_margin, params.route.closed_margin)
+        ways = params.route if planner.generates else params.follower.route
+        margin = jnp.where(squeeze, ways.squeeze_margin, ways.closed_margin)
         remembered = memory.update(
             spec.memory, remembered, clear >= robot.radius + margin, local.origin, grid.resolution, seen.goal
         )
@@ -264,7 +265,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         beyond = memory.beyond(spec.memory, remembered, grid.shape, spec.route.pooling)
         beyond = jnp.where(retreating, grids.UNREACHABLE, beyond)
         found = route.solve(
-            spec.route, params.route, clear, priced, jnp.where(retreating, 0.0, visits), local.origin,
+            spec.route, ways, clear, priced, jnp.where(retreating, 0.0, visits), local.origin,
             grid.resolution, seen.pose[:2], goal, robot, squeeze, beyond,
         )  # fmt: skip
         value, reachable = found.value, found.reachable
