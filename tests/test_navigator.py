@@ -13,7 +13,10 @@ from drnav_jax.filter import FilterSpec, RecoverySpec
 from drnav_jax.navigator import NavParams, NavSpec
 from drnav_jax.planning import PLANNERS, GeneratorSpec, TrackerSpec
 from drnav_jax.planning import recovery as behaviour
+from drnav_jax.planning.dwb import DwbSpec
+from drnav_jax.planning.follower import FollowerSpec
 from drnav_jax.planning.memory import MemorySpec
+from drnav_jax.planning.mppi import MppiSpec
 from drnav_jax.sim import kinematic, lidar
 from drnav_jax.sim.contact import clearance
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
@@ -305,6 +308,47 @@ def test_a_batch_of_128_equals_single_calls(trip, replan):
     compare_batch(trip[:128], replan)
 
 
+FOLLOWER = FollowerSpec(
+    dwb=DwbSpec(num_speeds=8, num_turns=10, max_steps=60),
+    mppi=MppiSpec(num_samples=300, num_steps=24, dt=0.1, immediate=True),
+)
+
+
+@pytest.mark.parametrize("planner", ["nav2-dwb", "nav2-mppi"])
+def test_followers_of_a_route_drive_around_the_wall(planner):
+    spec = dataclasses.replace(SPEC, planner=PLANNERS[planner], follower=FOLLOWER)
+    drive = jax.jit(navigator.step.__wrapped__, static_argnames=("spec", "replan"))
+    pose, twist = f32([0.0, 0.0, 0.2]), f32([0.0, 0.0])
+    state, path = navigator.init(spec, PARAMS, pose), []
+    for k in range(160):
+        seen = look(pose, twist, seed=k)
+        state, command, info = drive(spec, PARAMS, state, seen, jax.random.key(k), replan=k % 5 == 0)
+        assert within_limits(command, np.asarray(twist))
+        assert float(jnp.sum(info.critics.best)) < np.inf
+        pose, twist = kinematic.step(ROBOT, pose, twist, command, spec.dt)
+        path.append(np.asarray(pose))
+        if bool(info.arrived):
+            break
+    path = np.array(path)
+    assert bool(info.arrived) and path[:, 1].max() > 1.7
+    assert min(float(clearance(WORLD, f32(p[:2]))) for p in path) > ROBOT.radius
+
+
+@pytest.mark.parametrize("planner", ["mppi", "nav2-dwb"])
+def test_broken_sensors_give_followers_no_broken_command_either(trip, planner):
+    spec = dataclasses.replace(SPEC, planner=PLANNERS[planner], follower=FOLLOWER)
+    drive = jax.jit(navigator.step.__wrapped__, static_argnames=("spec", "replan"))
+    seen = trip[23][1]
+    for what in FAULTS:
+        state = navigator.init(spec, PARAMS, seen.pose)
+        for k, o in enumerate([seen, seen, *[broken(what, seen)] * 3, seen]):
+            state, command, info = drive(spec, PARAMS, state, o, jax.random.key(k), replan=k % 5 == 0)
+            assert bool(jnp.isfinite(command.v)) and bool(jnp.isfinite(command.omega)), what
+            assert -0.2 - 1e-6 <= float(command.v) <= 1.0 + 1e-6 and abs(float(command.omega)) <= 1.5 + 1e-6
+        finite = jax.tree.map(lambda a: bool(jnp.all(jnp.isfinite(a))), state._replace(points=state.points.xy))
+        assert all(jax.tree.leaves(finite)), what
+
+
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_every_planner_fits_together(planner):
     spec = dataclasses.replace(SPEC, planner=PLANNERS[planner])
@@ -321,7 +365,11 @@ def test_every_planner_fits_together(planner):
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
-    [({"dt": 0.0}, "dt must be > 0 s"), ({"replan_every": 0}, "replan_every >= 1")],
+    [
+        ({"dt": 0.0}, "dt must be > 0 s"),
+        ({"replan_every": 0}, "replan_every >= 1"),
+        ({"planner": PLANNERS["mppi"], "dt": 0.05}, "MPPI's step must be the tick, 0.05 s: follower.mppi.dt is 0.1"),
+    ],
 )
 def test_the_spec_is_checked(wrong, message):
     with pytest.raises(ValueError, match=message):

@@ -55,7 +55,7 @@ class FollowerSpec:
     """
 
     dwb: DwbSpec = DwbSpec()
-    mppi: MppiSpec = MppiSpec(num_steps=28, dt=0.1, noise=NoiseSpec(bank=8000))
+    mppi: MppiSpec = MppiSpec(num_steps=28, dt=0.1, immediate=True, noise=NoiseSpec(bank=8000))
     critics: CriticSpec = CriticSpec(critics=_CRITICS, cost_every=1, align_every=2)
     num_points: int = 96
     spacing: float = 0.05

@@ -5,7 +5,7 @@ One step, with u the control sequence kept from the last one, eps noise of K sam
     J = cost of driving c (`mppi_rollout`) + sum_axes gamma / sigma^2 sum_t u_t (c_t - u_t)                              (1)
     w = exp(-(J - min J) / temperature), normalised (`mppi_weights`);   u <- sum w c                                     (2)
     u <- Savitzky-Golay(u);   u_t clamped to the speed limits and to what is reachable from u_{t-1} (u_{-1}: measured)   (3)
-    send u_1, shift u to the left, repeat its last element                                                               (4)
+    send u_1 (u_0 where commands act at once), shift u to the left, repeat its last element                              (4)
 
 If every trajectory collides, u and the history are reset and the step is tried again; then it fails, and brakes.
 
@@ -46,6 +46,7 @@ class MppiSpec:
         adapt_temperature: Choose the temperature by `MppiParams.effective_share`.
         smooth: Savitzky-Golay filter.
         clamp: Clamp u to the limits.
+        immediate: Commands act at once, not a step later as Nav2 has it.
         num_explained: Best candidates whose terms are in Info.
     """
 
@@ -59,6 +60,7 @@ class MppiSpec:
     adapt_temperature: bool = False
     smooth: bool = True
     clamp: bool = True
+    immediate: bool = False
     num_explained: int = 10
 
     def __post_init__(self) -> None:
@@ -155,7 +157,7 @@ def update(
     if spec.num_disturbances > 1:
         gains = 1.0 + params.disturbance * jax.random.normal(key, (2, spec.num_disturbances), jnp.float32)
     priced = mppi_rollout.rollout(
-        cost, data, limits, pose, twist, control, deviation, sigma, dt=spec.dt, gains=gains
+        cost, data, limits, pose, twist, control, deviation, sigma, dt=spec.dt, gains=gains, immediate=spec.immediate
     )
     if spec.num_disturbances > 1:
         priced = mppi_weights.tail_mean(priced, spec.num_samples, params.tail)
@@ -224,7 +226,7 @@ def plan(
         control = savitzky_golay.smooth(control, history)
     if spec.clamp:
         control = clamp(limits, control, twist, spec.dt)
-    sent = jnp.where(info.failed, 0.0, control[1])
+    sent = jnp.where(info.failed, 0.0, control[0 if spec.immediate else 1])
     shifted = jnp.concatenate([control[1:], control[-1:]])
     state = MppiState(
         control=jnp.where(info.failed, 0.0, shifted),

@@ -6,6 +6,9 @@ With c = u + sigma eps, and v_0, omega_0 measured,
         where (up, down) = (a_max, |a_min|) if v_{t-1} > 0, else (|a_min|, a_max)
     yaw_t = yaw_0 + sum_{k<=t} omega_k dt,  x_t = x_0 + sum_{k<=t} v_k cos(yaw_{k-1}) dt,  y likewise                    (2)
 
+So Nav2 takes it that a command acts a step after it was sent, and it sends the second one. `immediate` is for robots whose
+commands act at once: v_t = clip(c_t, ...) from v_{-1} measured.
+
 What bounds it: one table look-up per sample and step, if the cost has one. State is a structure of `[K]` arrays carried by
 a scan, the heading turns by a polynomial, and costs accumulate while rolling out, so nothing of size T x K is written.
 """
@@ -93,6 +96,7 @@ def rollout(
     *,
     dt: float,
     gains: Float[Array, "2 D"] | None = None,
+    immediate: bool = False,
 ) -> Priced:
     """Drive c = control + scale deviation by (1) and (2), and price it.
 
@@ -108,6 +112,7 @@ def rollout(
         dt: Step [s].
         gains: D gains of v and omega between what is commanded and what is driven: every sequence is driven with each,
             and the result holds D blocks of K.
+        immediate: Commands act at once.
     """
     num_steps, _, num = deviation.shape
     copies = 1 if gains is None else gains.shape[1]
@@ -120,17 +125,25 @@ def rollout(
         c, s = dynamics.rotate(m.c, m.s, dw * dt)
         return Motion(x=m.x + dv * dt * m.c, y=m.y + dv * dt * m.s, c=c, s=s, v=dv, w=dw)
 
-    def step(carry: tuple, u: Array, eps: Array, phase: int) -> tuple:
-        m, v, w, costs = carry
+    def speeds(v: Array, w: Array, u: Array, eps: Array) -> tuple[Array, Array]:
+        """Equation (1)."""
         c = u[:, None] + scale[:, None] * eps
         c = jnp.tile(c, (1, copies)) if copies > 1 else c
-        v, w = reachable(v, c[0], up, down), dynamics.approach(w, c[1], turn)
+        return reachable(v, c[0], up, down), dynamics.approach(w, c[1], turn)
+
+    def step(carry: tuple, u: Array, eps: Array, phase: int) -> tuple:
+        m, v, w, costs = carry
+        v, w = speeds(v, w, u, eps)
         m = drive(m, v, w)
         return m, v, w, cost.step(data, costs, m, phase)
 
     begin = dynamics.start(pose, twist, num * copies)
-    first = drive(begin, begin.v, begin.w)
-    carry = (first, begin.v, begin.w, cost.begin(data, first))
+    v, w = begin.v, begin.w
+    if immediate:
+        v, w = speeds(v, w, control[0], deviation[0])
+        control, deviation = control[1:], deviation[1:]
+    first = drive(begin, v, w)
+    carry = (first, v, w, cost.begin(data, first))
     period = cost.period
     blocks = (num_steps - 1) // period
 

@@ -112,3 +112,22 @@ def test_batch_equals_loop_and_traces_once():
 def test_too_few_bearings_are_refused():
     with pytest.raises(ValueError, match="num_bearings must be >= 8"):
         FilterSpec(num_bearings=4)
+
+
+def test_what_is_forgotten_is_a_square_and_nothing_else():
+    state = random_state(3, (0.3, -0.2))
+    xy = jnp.asarray([0.32, -0.25], jnp.float32)
+    after = belief.forget(SPEC, state, xy, 0.25)
+    corner, res = np.asarray(state.corner), SPEC.grid.resolution
+    near = np.zeros(SPEC.grid.shape, bool)
+    for i, j in np.ndindex(near.shape):
+        x, y = (corner[1] + j + 0.5) * res, (corner[0] + i + 0.5) * res
+        near[i, j] = max(abs(x - 0.32), abs(y + 0.25)) <= 0.25
+    assert 16 <= near.sum() <= 36
+    np.testing.assert_array_equal(after.occupancy, np.where(near, 0, state.occupancy))
+    np.testing.assert_array_equal(after.seen, np.asarray(state.seen) & ~near)
+    np.testing.assert_array_equal(after.dead_end, state.dead_end)
+    top, left = belief.local_corner(SPEC)
+    fine = np.kron(near[top : top + 8, left : left + 8], np.ones((2, 2), bool))
+    np.testing.assert_array_equal(after.surface, np.where(fine, 0, state.surface))
+    chex.assert_trees_all_equal(belief.forget(SPEC, state, xy, -1.0), state)

@@ -141,12 +141,6 @@ def test_one_command_smooths_clamps_sends_the_second_and_shifts():
     np.testing.assert_allclose(after.history, np.concatenate([history[1:], want[1:2]]), rtol=CLOSE, atol=CLOSE)
 
 
-def hits_until(data, m):
-    """A cost under which every sample collides as long as the robot is at negative x."""
-    del m
-    return data
-
-
 def test_all_colliding_is_tried_again_then_fails_and_forgets():
     def finish(data, carry, m):
         del carry
@@ -259,6 +253,7 @@ def drive(spec, params, ticks, wall=True):
         {"noise": NoiseSpec(antithetic=True, bank=1000), "num_disturbances": 3},
         {"noise": NoiseSpec(kind="low_pass", bank=400), "adapt_temperature": True},
         {"rate_space": True},
+        {"immediate": True, "noise": NoiseSpec(bank=400)},
     ],
 )
 def test_it_drives_along_the_path_within_the_limits(change):
@@ -270,8 +265,10 @@ def test_it_drives_along_the_path_within_the_limits(change):
     tiny = 1e-5
     assert (twists[:, 0] <= 0.5 + tiny).all() and (twists[:, 0] >= -0.35 - tiny).all()
     assert (np.abs(twists[:, 1]) <= 1.9 + tiny).all()
-    step = np.diff(np.concatenate([np.zeros((1, 2)), twists]), axis=0)  # what is sent is the second of the sequence
-    assert np.abs(step[:, 0]).max() <= 2 * 3.0 * 0.05 + tiny and np.abs(step[:, 1]).max() <= 2 * 3.5 * 0.05 + tiny
+    step = np.diff(np.concatenate([np.zeros((1, 2)), twists]), axis=0)
+    ticks = 1 if spec.immediate else 2  # what is sent is the second of the sequence
+    assert np.abs(step[:, 0]).max() <= ticks * 3.0 * 0.05 + tiny
+    assert np.abs(step[:, 1]).max() <= ticks * 3.5 * 0.05 + tiny
 
 
 def test_it_passes_an_obstacle_on_the_path():

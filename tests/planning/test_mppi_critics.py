@@ -218,3 +218,22 @@ def test_rollouts_are_those_of_the_loops():
         if with_gains is not None:  # the second block is driven with other gains: as commanded, but for them
             np.testing.assert_allclose(got[:, 3, SAMPLES:], 0.9 * got[:, 3, :SAMPLES], rtol=CLOSE)
             np.testing.assert_allclose(got[:, 4, SAMPLES:], 1.2 * got[:, 4, :SAMPLES], rtol=CLOSE)
+
+
+def test_commands_that_act_at_once_drive_the_first_step():
+    rng = np.random.default_rng(1)
+    control, eps = rng.normal(0, 0.3, (STEPS, 2)), rng.normal(size=(STEPS, 2, SAMPLES))
+    twist = np.float32([0.2, -0.4])
+    speeds = mppi_rollout.running(lambda weights, m: weights[0] * m.v + weights[1] * m.w)
+    got = [
+        mppi_rollout.rollout(
+            speeds, f32(w), LIMITS, f32([0, 0, 0]), f32(twist), f32(control), f32(eps), f32([1, 1]), dt=DT, immediate=True
+        ).total
+        for w in ((1, 0), (0, 1))
+    ]
+    for k in range(SAMPLES):
+        c = control + eps[:, :, k]
+        # a sequence with one more command in front of it, that asks for no change and is not counted
+        longer = np.concatenate([c, c[-1:]])
+        *_, v, w = reference.mppi_rollout([0, 0, 0], twist, longer, LIMITS, DT)
+        np.testing.assert_allclose([g[k] for g in got], [v[1:].sum(), w[1:].sum()], rtol=CLOSE, atol=1e-4)
