@@ -20,11 +20,12 @@ from scipy import ndimage
 from scipy.sparse import coo_array, csgraph, csr_array
 
 from drnav_jax.types import GridMap
-from drnav_jax.worlds.world import Scene, World, from_grid, signed_distance
+from drnav_jax.worlds.world import Scene, World, from_grid, near_distance
 
 MAX_CELLS = 150_000  # of a search grid at 0.05 m; larger ones are searched at 0.1 m
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))  # half of the 16
 CACHED = 8  # graphs kept
+MARGIN = 1.0  # [m] beyond the clearance, up to which a graph knows the distance to the walls
 STRING_SPACING = 0.5  # [m] points of the string in its refining rounds
 STRING_ROUNDS = 3
 STRING_WINDOW = 80  # points that one point looks ahead
@@ -34,7 +35,7 @@ SLACK = 1e-3  # [m] sight lines may come this much closer to the walls
 class Graph(NamedTuple):
     """The cells of a map that keep a clearance, linked in 16 directions."""
 
-    distance: np.ndarray  # [H, W] to the walls [m]
+    distance: np.ndarray  # [H, W] to the walls [m], cut off at clearance + MARGIN
     origin: np.ndarray  # [2]
     resolution: float
     clearance: float
@@ -69,9 +70,7 @@ def _search_grid(occupied: np.ndarray, native: float) -> tuple[tuple[int, int], 
 
 def _build(world: World, origin: np.ndarray, shape: tuple[int, int], r: float, c: float) -> Graph:
     h, w = shape
-    x, y = origin[0] + (np.arange(w) + 0.5) * r, origin[1] + (np.arange(h) + 0.5) * r
-    centres = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
-    distance = signed_distance(world, centres.reshape(-1, 2)).reshape(h, w)
+    distance = near_distance(world, origin, shape, r, c + MARGIN)
     free = distance >= c
     node = np.where(free, np.cumsum(free).reshape(h, w) - 1, -1).astype(np.int32)
     tails, heads, lengths = [], [], []

@@ -189,6 +189,19 @@ def _blocking(world: World) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
+def _windows(rows: np.ndarray, pad: float, origin: Any, shape: tuple[int, int], resolution: float) -> list:
+    """Of each solid the slices of a grid that hold every centre within `pad` [m] of it; None if there are none."""
+    if rows.shape[1] == 7:
+        c, s = np.abs(np.cos(rows[:, 2])), np.abs(np.sin(rows[:, 2]))
+        half = np.stack([c * rows[:, 3] + s * rows[:, 4], s * rows[:, 3] + c * rows[:, 4]], axis=1)
+    else:
+        half = np.repeat(rows[:, 2:3], 2, axis=1)
+    reach = half + pad
+    low = np.floor((rows[:, :2] - reach - origin) / resolution).clip(0, shape[::-1]).astype(int)
+    high = np.ceil((rows[:, :2] + reach - origin) / resolution).clip(0, shape[::-1]).astype(int)
+    return [np.s_[y0:y1, x0:x1] if x1 > x0 and y1 > y0 else None for (x0, y0), (x1, y1) in zip(low, high, strict=True)]
+
+
 def rasterise(
     world: World, origin: tuple[float, float], shape: tuple[int, int], resolution: float
 ) -> np.ndarray:
@@ -201,13 +214,40 @@ def rasterise(
     x, y = x[None, :], y[:, None]
     occupied = np.zeros(shape, bool)
     boxes, cylinders = _blocking(world)
-    for bx, by, yaw, hx, hy, _, _ in boxes:
-        c, s = np.cos(yaw), np.sin(yaw)
-        along, across = c * (x - bx) + s * (y - by), -s * (x - bx) + c * (y - by)
-        occupied |= (np.abs(along) <= max(hx, resolution / 2)) & (np.abs(across) <= max(hy, resolution / 2))
-    for cx, cy, r, _, _ in cylinders:
-        occupied |= (x - cx) ** 2 + (y - cy) ** 2 <= r * r
+    for (bx, by, yaw, hx, hy, _, _), at in zip(boxes, _windows(boxes, resolution, origin, shape, resolution), strict=True):
+        if at is None:
+            continue
+        c, s, px, py = np.cos(yaw), np.sin(yaw), x[:, at[1]], y[at[0]]
+        along, across = c * (px - bx) + s * (py - by), -s * (px - bx) + c * (py - by)
+        occupied[at] |= (np.abs(along) <= max(hx, resolution / 2)) & (np.abs(across) <= max(hy, resolution / 2))
+    for (cx, cy, r, _, _), at in zip(cylinders, _windows(cylinders, resolution, origin, shape, resolution), strict=True):
+        if at is not None:
+            occupied[at] |= (x[:, at[1]] - cx) ** 2 + (y[at[0]] - cy) ** 2 <= r * r
     return occupied
+
+
+def near_distance(
+    world: World, origin: Any, shape: tuple[int, int], resolution: float, reach: float
+) -> np.ndarray:
+    """`signed_distance` at the centres of a grid's cells `[H, W]`, cut off at `reach` [m].
+
+    Each solid costs no more than the cells around it, so worlds may be large.
+    """
+    x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
+    y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
+    distance = np.full(shape, reach)
+    boxes, cylinders = _blocking(world)
+    for name, rows in (("boxes", boxes), ("cylinders", cylinders)):
+        for row, at in zip(rows, _windows(rows, reach, origin, shape, resolution), strict=True):
+            if at is not None:
+                points = np.stack(np.broadcast_arrays(x[None, at[1]], y[at[0], None]), axis=-1)
+                here = signed_distance(make_world(**{name: row[None]}), points.reshape(-1, 2))
+                np.minimum(distance[at], here.reshape(points.shape[:2]), out=distance[at])
+    if np.asarray(world.field.values).size:
+        points = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1)
+        walls = signed_distance(make_world(field=world.field), points.reshape(-1, 2))
+        np.minimum(distance, walls.reshape(shape), out=distance)
+    return distance
 
 
 def signed_distance(world: World, points: np.ndarray) -> np.ndarray:

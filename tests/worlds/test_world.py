@@ -16,6 +16,7 @@ from drnav_jax.worlds import (
     signed_distance,
     stack_worlds,
 )
+from drnav_jax.worlds.world import near_distance
 
 
 def test_distance_field_is_zero_at_the_edge_between_cells():
@@ -134,3 +135,17 @@ def test_a_thin_pane_lets_nobody_through_its_cells(yaw, shift):
     occupied = rasterise(pane, (-2.0, -2.0), (40, 40), 0.1)
     _, parts = ndimage.label(~occupied)  # 4-connected
     assert parts == 2
+
+
+def test_near_distance_is_the_signed_distance_cut_off():
+    boxes = [[3.0, 2.0, 0.4, 1.5, 0.1, 0, 2], [-30.0, 0.0, 0.0, 1.0, 1.0, 0, 2], [1.0, 4.5, 0.0, 40.0, 0.05, 0, 2]]
+    walls = np.zeros((12, 9), bool)
+    walls[3:5, 2:6] = True
+    for field in (None, from_grid(walls, (0.3, 0.2), 0.25).field):
+        world = make_world(boxes, [[5.0, 1.0, 0.3, 0, 2]], field)
+        origin, shape, r, reach = (-0.7, -1.3), (61, 83), 0.1, 0.8
+        x, y = (origin[k] + (np.arange(shape[1 - k]) + 0.5) * r for k in (0, 1))
+        points = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        full = np.minimum(signed_distance(world, points), reach).reshape(shape)
+        np.testing.assert_array_equal(near_distance(world, origin, shape, r, reach), full)
+        assert full.min() < -0.05 and (full == reach).any() and (full < reach).any()
