@@ -2,10 +2,11 @@
 
 What the rays meet is found in `sight`, its colours in `shading`. Then comes the sensor: with the light L of a pixel,
 
-    value = clip(gain L (1 - vignette rho^2), 0, 1) + noise                                     (1)
+    value = curve(gain L (1 - vignette rho^2)) + noise                                          (1)
 
-where the gain of each channel is the scenery's exposure with the jitter of this image, rho is the distance from the
-image's middle (1 in the corners), and the noise grows with the light.
+clipped to 0..1. The gain of each channel is the scenery's exposure with the jitter of this image, rho the distance from
+the image's middle (1 in the corners); the curve bends what is brighter than `KNEE` towards white, so that it keeps its
+texture; the noise grows with the value.
 """
 
 import functools
@@ -21,6 +22,8 @@ from drnav_jax.sim.shading import Colour, surface_colour, table_of, veil_colour
 from drnav_jax.sim.sight import Veil, meet, rays_of
 from drnav_jax.types import CameraRig, RigSpec, Scalar
 from drnav_jax.worlds.world import World
+
+KNEE = 0.6  # [] value from which on the curve bends; below, it is the identity
 
 _f32 = functools.partial(jnp.asarray, dtype=jnp.float32)
 
@@ -48,12 +51,13 @@ def _sensor(params: CameraParams, exposure: Scalar, colour: Array, key: PRNGKeyA
         ahead = jax.lax.slice_in_dim(light, 1, size, axis=axis), jax.lax.slice_in_dim(light, size - 1, size, axis=axis)
         back = jax.lax.slice_in_dim(light, 0, 1, axis=axis), jax.lax.slice_in_dim(light, 0, size - 1, axis=axis)
         light = (1 - 2 * blur) * light + blur * (jnp.concatenate(ahead, axis) + jnp.concatenate(back, axis))
+    light = jnp.minimum(light, KNEE) + (1 - KNEE) * (1 - jnp.exp(-jnp.maximum(light - KNEE, 0.0) / (1 - KNEE)))
     light = once(light)
     # The sum of a word's four bytes is nearly normal: to 3.4 standard deviations, which is enough for a sensor.
     bits = jax.random.bits(noise_key, (3, h, w), jnp.uint32)
     a, b, c, d = (((bits >> k) & 0xFF).astype(jnp.int32) for k in (0, 8, 16, 24))
     normal = (a + b + c + d - 510).astype(jnp.float32) * (1 / 147.8)
-    grain = _f32(params.noise_std) * (0.5 + jnp.clip(light, 0.0, 1.0))
+    grain = _f32(params.noise_std) * (0.5 + light)
     return jnp.clip(light + grain * normal, 0.0, 1.0)
 
 

@@ -163,7 +163,7 @@ def surface_colour(world: World, table: Array, rays: Rays, hits: Hits) -> Colour
     own = _mix(own, lamp, light)
     sun = scenery.sun
     lit = scenery.ambient + (1 - scenery.ambient) * jnp.maximum(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0)
-    lit = jnp.where(row(_MATERIAL) == CEILING, scenery.ambient + 0.3 + 0.4 * light, lit)  # lamps light it from below
+    lit = jnp.where(row(_MATERIAL) == CEILING, 0.3 + 0.5 * scenery.ambient + light, lit)  # lamps shine
     corner = jnp.where(face.upright, 0.72 + 0.28 * jnp.clip(at.z / 0.4, 0.0, 1.0), 1.0)
     up = rays.dz / length
     clear = jnp.exp(-(scenery.fog + HAZE) * depth * length)

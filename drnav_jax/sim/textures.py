@@ -53,7 +53,7 @@ class Look(NamedTuple):
 _LOOKS: dict[int, Look] = {
     Material.WALL: Look(dark=(0.3, 0.3, 0.3)),
     Material.BRICK: Look(light=(0.72, 0.69, 0.64), fine=(22.0, 22.0, 0.12)),
-    Material.WOOD: Look(dark=(0.16, 0.09, 0.05), light=(0.85, 0.82, 0.7), coarse=(9.0, 0.5, 0.25), fine=(45.0, 1.5, 0.22)),
+    Material.WOOD: Look(dark=(0.16, 0.09, 0.05), light=(0.85, 0.82, 0.7), coarse=(13.0, 0.6, 0.14), fine=(45.0, 1.5, 0.2)),
     Material.METAL: Look(dark=(0.07, 0.07, 0.08), light=(1.0, 0.75, 0.3), fine=(70.0, 0.6, 0.12), shine=0.35),
     Material.CONCRETE: Look(dark=(0.2, 0.2, 0.2), coarse=(1.6, 1.6, 0.16), fine=(14.0, 14.0, 0.1)),
     Material.CAR: Look(dark=(0.05, 0.06, 0.08), coarse=(1.0, 1.0, 0.0), fine=(1.0, 1.0, 0.0), shine=0.18),
@@ -153,7 +153,7 @@ def _wood(face: Face, seed: Scalar) -> Pattern:
     handle = _band(face.u, face.half - 0.17, face.half - 0.07, face.pixel) * _band(face.v, 0.96, 1.06, face.pixel)
     of_door = jnp.maximum(_only(inset, jnp.full_like(edge, 0.5)), 0.55 * edge)
     joints = jnp.where(door, of_door, 0.7 * _lines(face.u + 0.1, 0.2, 0.014, face.pixel))
-    return 1.0 + jnp.where(door, 0.0, 0.3 * tone), joints, jnp.where(door, handle, 0.0)
+    return 1.0 + jnp.where(door, 0.0, 0.4 * tone), joints, jnp.where(door, handle, 0.0)
 
 
 def _metal(face: Face) -> Pattern:
