@@ -70,6 +70,13 @@ def test_depth_is_that_of_mujocos_renderer(mounts, seed):
     assert near.any() and error[near].max() < 1e-3
 
 
+def test_without_opengl_one_is_told_what_to_install(monkeypatch):
+    monkeypatch.setattr(bench_sensors, "GL", ("none-such",))
+    world = bench_sensors.random_obstacles(0, 2)
+    with pytest.raises(RuntimeError, match="install libegl1 or libosmesa6 .none-such: .*none-such"):
+        bench_sensors.native_views(SMALL, world, rig_of(SMALL), np.zeros((1, 3), np.float32))
+
+
 # One ray at a time, in float64. What the rays of all pixels are is `rays_of` below, from the mounts' own definition.
 
 
