@@ -178,9 +178,8 @@ def _allowed(costs: list[Array]) -> UInt8[Array, "H W"]:
 
 
 def _sweep(
-    value: Float[Array, "H W"], step: Float[Array, "H W"], allowed: UInt8[Array, "H W"], straight: tuple[int, int],
-    rows: Array,
-) -> tuple[Float[Array, "H W"], Array]:
+    value: Float[Array, "H W"], step: Float[Array, "H W"], allowed: UInt8[Array, "H W"], straight: tuple[int, int]
+) -> Float[Array, "H W"]:
     """Settle all paths along which rows only fall, and all along which they only rise.
 
     Args:
@@ -188,8 +187,6 @@ def _sweep(
         step: Cost of a straight move from each cell.
         allowed: `_allowed` of east, west, north, south, diagonal and knight moves.
         straight: Bits of the straight moves to lower rows, and to higher rows.
-        rows: `[H + 2, 2, W + 4]`, `UNREACHABLE` around: where both are worked on, the second from the last row on. It is
-            handed from sweep to sweep, since laying out another one takes as long as a sweep.
     """
     h, w = value.shape
     ahead = jnp.asarray(straight, jnp.uint8)[:, None]
@@ -206,8 +203,10 @@ def _sweep(
         jump = lesser(lesser(one[:, :-4], one[:, 4:]), lesser(two[:, 1:-3], two[:, 3:-1]))
         return jax.lax.dynamic_update_slice(rows, lesser(best, jump + gate(32, 5**0.5))[None], (i + 2, 0, 2))
 
+    # both ways at once, the second from the last row on
+    rows = jnp.full((h + 2, 2, w + 4), UNREACHABLE, jnp.float32)
     rows = jax.lax.fori_loop(0, h, settle, rows)
-    return lesser(rows[2:, 0, 2:-2], rows[2:, 1, 2:-2][::-1]), rows
+    return lesser(rows[2:, 0, 2:-2], rows[2:, 1, 2:-2][::-1])
 
 
 @partial(jax.jit, static_argnames=("max_iterations",))
@@ -239,18 +238,17 @@ def cost_to_go(
     step, allowed = once((jnp.minimum(cell_cost * resolution, UNREACHABLE), _allowed(costs)))
     step_t, allowed_t = once((step.T, allowed.T))
 
-    def sweep(carry: tuple) -> tuple:
-        before, _, count, rows, cols = carry
-        after, rows = _sweep(before, step, allowed, (8, 4), rows)
-        after, cols = _sweep(after.T, step_t, allowed_t, (2, 1), cols)
-        after = after.T
-        return after, jnp.any(after < before), count + 1, rows, cols
+    def sweep(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        before, _, count = carry
+        after = _sweep(before, step, allowed, (8, 4))
+        after = _sweep(after.T, step_t, allowed_t, (2, 1)).T
+        return after, jnp.any(after < before), count + 1
 
-    h, w = cell_cost.shape
-    room = [jnp.full((n + 2, 2, m + 4), UNREACHABLE, jnp.float32) for n, m in ((h, w), (w, h))]
-    begin = (value, jnp.asarray(True), jnp.asarray(0, jnp.int32), *room)
-    value = jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < max_iterations), sweep, begin)[0]
-    return jnp.minimum(value, UNREACHABLE)
+    def unfinished(carry: tuple[Array, Array, Array]) -> Array:
+        return carry[1] & (carry[2] < max_iterations)
+
+    begin = (value, jnp.asarray(True), jnp.asarray(0, jnp.int32))
+    return jnp.minimum(jax.lax.while_loop(unfinished, sweep, begin)[0], UNREACHABLE)
 
 
 @partial(jax.jit, static_argnames=("num_steps",))
