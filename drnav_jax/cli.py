@@ -53,6 +53,8 @@ class Trial:
         horizon: H, how far ahead candidates are rolled out [s].
         seed: Of sensor noise and of sampled trips.
         split: Which worlds a family's seeds mean.
+        physics: How the robot moves; mjx: with inertia, grip and contact forces.
+        mjx_boxes: Boxes that a world may have with mjx, a map's walls merged into rectangles.
         time_limit: Time allowed per episode [s].
         robot_radius: Footprint radius [m].
         max_speed: Fastest speed [m/s].
@@ -76,6 +78,8 @@ class Trial:
     horizon: Annotated[float | None, _flag("S", "default: the planner's, 4 s")] = None
     seed: Annotated[int, _flag("N")] = 0
     split: Literal["train", "val", "test"] = "test"
+    physics: Literal["kinematic", "mjx"] = "kinematic"
+    mjx_boxes: Annotated[int, _flag("N")] = evaluate.Setup.mjx_boxes
     time_limit: Annotated[float | None, _flag("S", "default: BARN 100; else 6 x optimal time, at least 60")] = None
     robot_radius: Annotated[float, _flag("M")] = evaluate.Setup.robot_radius
     max_speed: Annotated[float, _flag("M/S")] = evaluate.Setup.max_speed
@@ -187,7 +191,7 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
     if len(set(names)) < len(names):
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
     same = ("predictor", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
-    common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed")}
+    common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
     return {name: evaluate.Setup(planner=name, **common) for name in names}
 
 
@@ -293,7 +297,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
                 path = evaluate.path_driven(e.result, k, trip.scene.start)
                 drives[name] = report.Drive(path, e.records[e.kept.index(k)])
         batch = jax.tree.map(lambda a: a[0], evaluate.episode_params([trip], setup))
-        states = episode.replay(SPEC, evaluate.policy_of(spec), batch, keys[k])
+        states = episode.replay(evaluate.with_physics(SPEC, setup), evaluate.policy_of(spec), batch, keys[k])
         path = drives[first].path
         every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
         believed = report.believe(states, spec.filter, path, SPEC.dt, every)

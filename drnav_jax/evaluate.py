@@ -15,14 +15,17 @@ from drnav_jax.models import geometric, oracle, silent
 from drnav_jax.navigator import NavParams, NavSpec
 from drnav_jax.planning.compositions import planner
 from drnav_jax.planning.goal_generator import GeneratorSpec
-from drnav_jax.sim import episode
+from drnav_jax.sim import episode, mjx
 from drnav_jax.sim.episode import EpisodeParams, EpisodeSpec
 from drnav_jax.sim.lidar import LidarParams
+from drnav_jax.sim.mjx import MjxSpec
 from drnav_jax.types import GridMap, RobotParams
 from drnav_jax.worlds import Scene
 from drnav_jax.worlds.truth import TruthSpec, truth
 
 PREDICTORS = ("geometric", "oracle", "none")
+PHYSICS = ("kinematic", "mjx")
+STEP_LENGTH = 0.0125  # [m] that the fastest robot moves in one time step of MJX: how deep it may enter an obstacle
 LABEL_RESOLUTION = 0.1  # [m] labels need no finer grid
 
 
@@ -43,6 +46,8 @@ class Setup:
         limit_factor: See `time_limit`.
         num_candidates: Candidates of the goal generator, controls and headings together.
         seed: Of sensor noise.
+        physics: How the robot moves: kinematic, or mjx (inertia, grip and contact forces).
+        mjx_boxes: Boxes that a world may have with mjx, its map's walls merged into rectangles.
     """
 
     planner: str = "drnav"
@@ -57,10 +62,14 @@ class Setup:
     limit_factor: float = 6.0
     num_candidates: int = 1024
     seed: int = 0
+    physics: str = "kinematic"
+    mjx_boxes: int = MjxSpec.num_boxes
 
     def __post_init__(self) -> None:
         """Check ranges."""
         planner(self.planner)
+        if self.physics not in PHYSICS:
+            raise ValueError(f'There is no physics "{self.physics}": choose from {", ".join(PHYSICS)}.')
         if self.predictor not in PREDICTORS:
             raise ValueError(f'There is no predictor "{self.predictor}": choose from {", ".join(PREDICTORS)}.')
         rules = {
@@ -74,6 +83,18 @@ class Setup:
                 raise ValueError(f"{name} must lie within {low}..{high} {unit}".rstrip() + f", got {value}.")
         if self.num_candidates < 320:
             raise ValueError(f"num_candidates must be >= 320, got {self.num_candidates}.")
+
+
+def with_physics(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
+    """The spec of episodes with the setup's physics in it; a fast robot is simulated in shorter time steps.
+
+    Raises:
+        ValueError: If `mjx_boxes` is out of range.
+    """
+    if setup.physics == "kinematic":
+        return dataclasses.replace(spec, physics=None)
+    steps = math.ceil(spec.dt * max(setup.max_speed, 1.0) / STEP_LENGTH - 1e-9)
+    return dataclasses.replace(spec, physics=MjxSpec(timestep=spec.dt / steps, num_boxes=setup.mjx_boxes))
 
 
 class Trip(NamedTuple):
@@ -122,8 +143,12 @@ def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:
     """Check that every scene's trip can be driven, and what would be optimal.
 
     Raises:
-        ValueError: If a start or goal is not free, or no way joins them; says where and what to do.
+        ValueError: If a start or goal is not free, or no way joins them, or the world is too large for the physics;
+            says where and what to do.
     """
+    physics = with_physics(EpisodeSpec(), setup).physics
+    if physics is not None:
+        mjx.solids_of([scene.world for scene in scenes], physics)
     margin = plan_margin(NavParams())
     trips = []
     for scene in scenes:
@@ -194,6 +219,8 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
     batch = len(trips)
     spread = lambda tree: _stack([tree] * batch)  # noqa: E731
+    physics = with_physics(EpisodeSpec(), setup).physics
+    solids = () if physics is None else mjx.solids_of([t.scene.world for t in trips], physics)
     return EpisodeParams(
         world=worlds.stack_worlds([t.scene.world for t in trips]),
         start=_float32([t.scene.start for t in trips]),
@@ -204,6 +231,8 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         policy=_stack(each),
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
         faults=spread(episode.FaultParams()),
+        motors=() if physics is None else spread(mjx.MjxParams()),
+        solids=solids,
     )
 
 
@@ -234,7 +263,7 @@ def evaluate(
         setup: Robot, planner, predictor.
         params: Overrides the setup's navigator parameters.
         progress: Called with the number of finished episodes.
-        spec: Sizes of the simulation.
+        spec: Sizes of the simulation; its physics is the setup's.
 
     Raises:
         ValueError: If there is no trip.
@@ -246,7 +275,7 @@ def evaluate(
     batch = episode_params(trips, setup, params)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
     policy = policy_of(spec_of(setup.planner, setup.predictor, setup.num_candidates))
-    result = episode.run(spec, policy, batch, keys, progress=progress)
+    result = episode.run(with_physics(spec, setup), policy, batch, keys, progress=progress)
     kept = [k for k in range(len(trips)) if result.finished[k]]
     if not kept:
         raise KeyboardInterrupt

@@ -18,9 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
-from drnav_jax.sim import contact, kinematic, lidar
+from drnav_jax.sim import contact, kinematic, lidar, mjx
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
+from drnav_jax.sim.mjx import MjxSpec
 from drnav_jax.types import Command, Observation, RobotParams, empty_observation
 from drnav_jax.worlds.world import World
 
@@ -49,6 +50,8 @@ class EpisodeSpec:
         replan_every: Ticks per replan.
         chunk_ticks: Ticks per compiled call; a multiple of `replan_every`.
         lanes: Episodes vmapped together.
+        physics: None = `kinematic`; or the sizes of the MJX model.
+        max_delay: Longest `FaultParams.delay` [ticks].
     """
 
     lidar: LidarSpec = LidarSpec()
@@ -56,6 +59,8 @@ class EpisodeSpec:
     replan_every: int = 5
     chunk_ticks: int = 50
     lanes: int = 1
+    physics: MjxSpec | None = None
+    max_delay: int = 10
 
     def __post_init__(self) -> None:
         """Check sizes."""
@@ -67,6 +72,10 @@ class EpisodeSpec:
             )
         if self.lanes < 1:
             raise ValueError(f"lanes must be >= 1, got {self.lanes}.")
+        if self.max_delay < 0:
+            raise ValueError(f"max_delay must be >= 0 ticks, got {self.max_delay}.")
+        if self.physics is not None:
+            self.physics.steps_in(self.dt)
 
 
 class EpisodeParams(NamedTuple):
@@ -81,6 +90,8 @@ class EpisodeParams(NamedTuple):
     policy: Any  # the policy's parameters
     lidar: LidarParams = LidarParams()
     faults: FaultParams = FaultParams()
+    motors: Any = ()  # `mjx.MjxParams` if the physics is MJX
+    solids: Any = ()  # `mjx.Solids` of the world if the physics is MJX
 
 
 class EpisodeState(NamedTuple):
@@ -88,7 +99,9 @@ class EpisodeState(NamedTuple):
 
     pose: Array  # [3] true pose in the world
     odometry: Array  # [3] pose as the robot believes it
-    twist: Array  # [2]
+    twist: Array  # [2] of the wheels
+    body: Any  # `mjx.Body`, or () with kinematic physics
+    pending: Array  # [max_delay, 2] the last commands, newest first
     policy: Any
     key: Array
     tick: Array  # [] int32
@@ -109,12 +122,13 @@ class Log(NamedTuple):
     policy: Any  # the policy's own log
 
 
-def start(policy: Policy, params: EpisodeParams, key: PRNGKeyArray) -> EpisodeState:
+def start(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, key: PRNGKeyArray) -> EpisodeState:
     """The episode before its first tick (one episode; the caller vmaps)."""
     zero = jnp.zeros((), jnp.float32)
     pose = jnp.asarray(params.start, jnp.float32)
     return EpisodeState(
-        pose=pose, odometry=pose, twist=jnp.zeros(2, jnp.float32), policy=policy.init(params.policy, pose), key=key,
+        pose=pose, odometry=pose, twist=jnp.zeros(2, jnp.float32), body=() if spec.physics is None else mjx.init(),
+        pending=jnp.zeros((spec.max_delay, 2), jnp.float32), policy=policy.init(params.policy, pose), key=key,
         tick=jnp.zeros((), jnp.int32), active=jnp.asarray(True), success=jnp.asarray(False),
         collision=jnp.asarray(False), distance=zero, retreat=zero, min_clearance=jnp.asarray(jnp.inf, jnp.float32),
     )  # fmt: skip
@@ -130,11 +144,20 @@ def tick(
         points=points, point_valid=valid, pose=state.odometry, twist=state.twist, goal=params.goal
     )
     mind, command, log = policy.step(params.policy, state.policy, observation, key_policy, replan)
-    pose, twist = kinematic.step(params.robot, state.pose, state.twist, command, spec.dt, params.faults)
+    pending, reached = kinematic.delayed(state.pending, command, spec.dt, params.faults)
+    body, grazed = (), jnp.asarray(jnp.inf, jnp.float32)
+    if spec.physics is None:
+        pose, twist = kinematic.step(params.robot, state.pose, state.twist, reached, spec.dt, params.faults)
+    else:
+        pose, twist, body = mjx.step(
+            spec.physics, params.motors, params.robot, params.solids, state.pose, state.body, reached, spec.dt,
+            params.faults,
+        )  # fmt: skip
+        grazed = jnp.where(body.contact, -body.depth, grazed)  # contact between the instants that are looked at
     odometry = kinematic.odometry(state.odometry, state.pose, pose, params.faults)
     middle = 0.5 * (state.pose[:2] + pose[:2])
     room = jnp.minimum(contact.clearance(params.world, pose[:2]), contact.clearance(params.world, middle))
-    room = room - params.robot.radius
+    room = jnp.minimum(room - params.robot.radius, grazed)
     hit = room < 0
     to_goal = jnp.hypot(pose[0] - params.goal[0], pose[1] - params.goal[1])
     from_goal = jnp.hypot(state.pose[0] - params.goal[0], state.pose[1] - params.goal[1])
@@ -143,7 +166,8 @@ def tick(
     late = (state.tick + 1).astype(jnp.float32) * spec.dt >= params.time_limit
     going = state.active
     new = EpisodeState(
-        pose=pose, odometry=odometry, twist=twist, policy=mind, key=state.key, tick=state.tick + 1,
+        pose=pose, odometry=odometry, twist=twist, body=body, pending=pending, policy=mind, key=state.key,
+        tick=state.tick + 1,
         active=~(hit | arrived | late), success=arrived, collision=hit, distance=state.distance + moved,
         retreat=state.retreat + jnp.maximum(to_goal - from_goal, 0.0),
         min_clearance=jnp.minimum(state.min_clearance, room),
@@ -175,7 +199,7 @@ def chunk(
 
 @partial(jax.jit, static_argnames=("spec", "policy"))
 def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: Key[Array, " B"]) -> EpisodeState:
-    return jax.lax.map(lambda a: start(policy, *a), (params, keys), batch_size=spec.lanes)
+    return jax.lax.map(lambda a: start(spec, policy, *a), (params, keys), batch_size=spec.lanes)
 
 
 @partial(jax.jit, static_argnames=("spec", "policy"), donate_argnames="state")
@@ -225,7 +249,15 @@ def run(
 
     Returns:
         Results of all episodes. After a KeyboardInterrupt: as far as they got, `finished` False for the rest.
+
+    Raises:
+        ValueError: If a command is delayed for longer than the spec allows for, or MJX lacks its parameters.
     """
+    longest = float(np.max(params.faults.delay)) / spec.dt
+    if round(longest) > spec.max_delay:
+        raise ValueError(f"faults.delay is {longest:.1f} ticks, EpisodeSpec.max_delay {spec.max_delay}: raise it.")
+    if spec.physics is not None and not (params.motors and params.solids):
+        raise ValueError("MJX needs EpisodeParams.motors (MjxParams) and .solids (mjx.solids_of).")
     count = keys.shape[0]
     shards = [np.arange(k, count, workers) for k in range(min(workers, count))]
     done, stop = [0] * len(shards), threading.Event()

@@ -24,6 +24,28 @@ class FaultParams(NamedTuple):
     slip_omega: Scalar = 0.0  # [] fraction of the wheels' turn rate that does not reach the ground
     drift_distance: Scalar = 0.0  # [] fraction by which odometry over-reports what is travelled
     drift_yaw: Scalar = 0.0  # [] heading error that odometry gathers [rad/m]
+    delay: Scalar = 0.0  # [] between a command and the motors; whole ticks, rounded [s]
+
+
+@jax.jit
+def delayed(
+    pending: Float[Array, "ticks 2"], command: Command, dt: Scalar, faults: FaultParams
+) -> tuple[Float[Array, "ticks 2"], Command]:
+    """What reaches the motors at this tick.
+
+    Args:
+        pending: The commands of the last ticks, newest first; zeros before there were any.
+        command: The one given now.
+        dt: Tick [s].
+        faults: The delay; what is longer than `pending` counts as that long.
+
+    Returns:
+        (pending for the next tick, command that has come through now).
+    """
+    every = jnp.concatenate([jnp.stack([command.v, command.omega])[None], pending])
+    ticks = jnp.round(jnp.asarray(faults.delay, jnp.float32) / dt).astype(jnp.int32)
+    through = every[jnp.clip(ticks, 0, pending.shape[0])]
+    return every[:-1], Command(v=through[0], omega=through[1])
 
 
 @jax.jit

@@ -151,7 +151,8 @@ def solids_of(worlds: list[World], spec: MjxSpec = MjxSpec()) -> Solids:  # noqa
     Raises:
         ValueError: If a world has more boxes or cylinders than the model takes; says how many and what to do.
     """
-    every = [_rows(world) for world in worlds]
+    known = {id(world): _rows(world) for world in worlds}  # trips on one map share their world
+    every = [known[id(world)] for world in worlds]
     limits = ((0, "boxes (a map's walls are merged into rectangles)", "num_boxes"), (1, "cylinders", "num_posts"))
     for which, what, limit in limits:
         most, held = max((len(rows[which]) for rows in every), default=0), getattr(spec, limit)
