@@ -25,6 +25,7 @@ import functools
 import importlib
 import io
 import threading
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -59,7 +60,8 @@ class MjxSpec:
         near_boxes: Boxes that the model holds: those nearest to the robot at the beginning of a tick.
         near_posts: Cylinders that it holds.
         max_contacts: Contacts that are solved: the deepest.
-        iterations: Newton iterations of the contact solver.
+        iterations: Newton iterations of the contact solver; with one, robots slide around corners too fast.
+        ls_iterations: Iterations of its line search.
     """
 
     timestep: float = 0.0125
@@ -67,8 +69,9 @@ class MjxSpec:
     num_posts: int = 1024
     near_boxes: int = 8
     near_posts: int = 4
-    max_contacts: int = 8
-    iterations: int = 1
+    max_contacts: int = 4
+    iterations: int = 2
+    ls_iterations: int = 4
 
     def __post_init__(self) -> None:
         """Check sizes."""
@@ -163,7 +166,7 @@ def solids_of(worlds: list[World], spec: MjxSpec = MjxSpec()) -> Solids:  # noqa
                 f"raise {limit}{flag}, or use kinematic physics (--physics kinematic)."
             )
 
-    def padded(which: int, empty: list[float]) -> Any:
+    def padded(which: int, empty: tuple[float, ...]) -> Any:
         count = max(len(rows[which]) for rows in every)
         count = max(-(-count // PAD) * PAD, PAD)
         out = np.tile(np.asarray(empty, np.float32), (len(every), count, 1))
@@ -171,7 +174,7 @@ def solids_of(worlds: list[World], spec: MjxSpec = MjxSpec()) -> Solids:  # noqa
             out[k, : len(rows[which])] = rows[which]
         return out
 
-    return Solids(boxes=padded(0, [FAR, FAR, 0, 1, 1]), posts=padded(1, [FAR, FAR, 1]))
+    return Solids(boxes=padded(0, (FAR, FAR, 0.0, 1.0, 1.0)), posts=padded(1, (FAR, FAR, 1.0)))
 
 
 def load() -> tuple[Any, Any]:
@@ -189,7 +192,7 @@ def xml(spec: MjxSpec) -> str:
     return f"""
 <mujoco>
   <option timestep="{spec.timestep}" gravity="0 0 0" integrator="Euler" solver="Newton" cone="pyramidal"
-          iterations="{spec.iterations}" ls_iterations="4">
+          iterations="{spec.iterations}" ls_iterations="{spec.ls_iterations}">
     <flag eulerdamp="disable"/>
   </option>
   <default><geom solref="{2 * spec.timestep} 1" solimp="0.9 0.95 0.001"/></default>
@@ -223,7 +226,7 @@ def model(spec: MjxSpec) -> tuple[Any, Any]:
 
 
 @contextlib.contextmanager
-def _mjx_promotion() -> Any:
+def _mjx_promotion() -> Iterator[None]:
     """MJX relies on JAX's default promotion, whatever the caller has set."""
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
