@@ -5,6 +5,7 @@ from drnav_jax.worlds.families import FAMILIES, SPLITS, sample, twin
 from drnav_jax.worlds.maps import load_floor_plan, load_map_server, load_occupancy
 from drnav_jax.worlds.materials import BLOCKS, EXTINCTION, FLOORS, Material
 from drnav_jax.worlds.moving_ai import ScenarioTrip, load_moving_ai, load_scenario, with_scenario
+from drnav_jax.worlds.ranges import HELD_OUT, RANGES
 from drnav_jax.worlds.trips import check_trip, sample_trips, shortest_path, trip_cells
 from drnav_jax.worlds.world import (
     FAR,
@@ -31,6 +32,8 @@ __all__ = [
     "FAR",
     "FLOORS",
     "HEADROOM",
+    "HELD_OUT",
+    "RANGES",
     "SPLITS",
     "WALL_HEIGHT",
     "Material",

@@ -21,7 +21,7 @@ from drnav_jax.worlds.openings import OpeningSpec, openings
 from drnav_jax.worlds.truth import GroundTruth
 
 RETREAT = 4.0  # [m] of depth by which recoverability falls to 1/e
-NEVER, BEFORE, NOW = range(3)  # visibility classes
+NOW, BEFORE, NEVER = range(3)  # visibility classes
 _CHUNK = 128  # poses at a time
 
 
@@ -118,7 +118,7 @@ def visibility(
     pose: Float[Array, "3"],
     bev: BevSpec = BevSpec(),  # noqa: B008 (immutable)
 ) -> UInt8[Array, "h w"]:
-    """Visibility class of each cell of the bird's-eye grid: `NEVER`, `BEFORE` or `NOW` (0, 1, 2).
+    """Visibility class of each cell of the bird's-eye grid: `NOW`, `BEFORE` or `NEVER` (0, 1, 2).
 
     Pure and jittable (`bev` static); for one robot.
 

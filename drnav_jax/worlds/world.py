@@ -31,14 +31,14 @@ class Scenery(NamedTuple):
     """Ground, sky, light, and what a grid map's walls are made of."""
 
     ground_material: Scalar = int(Material.CONCRETE)  # [] `Material`
-    ground_colour: Array | tuple = (0.45, 0.45, 0.43)  # [3] albedo
+    ground_colour: Array | np.ndarray | tuple = (0.45, 0.45, 0.43)  # [3] albedo
     wall_material: Scalar = int(Material.WALL)  # [] `Material` of the walls of `World.field`
-    wall_colour: Array | tuple = (0.75, 0.73, 0.68)  # [3] albedo
+    wall_colour: Array | np.ndarray | tuple = (0.75, 0.73, 0.68)  # [3] albedo
     ceiling: Scalar = np.inf  # [] height [m]; inf = open sky
-    ceiling_colour: Array | tuple = (0.85, 0.85, 0.85)  # [3] albedo
-    sun: Array | tuple = (0.48, 0.32, 0.82)  # [3] unit vector towards the light
+    ceiling_colour: Array | np.ndarray | tuple = (0.85, 0.85, 0.85)  # [3] albedo
+    sun: Array | np.ndarray | tuple = (0.48, 0.32, 0.82)  # [3] unit vector towards the light
     ambient: Scalar = 0.5  # [] share of the light that has no direction, 0..1
-    sky_colour: Array | tuple = (0.55, 0.72, 0.95)  # [3]
+    sky_colour: Array | np.ndarray | tuple = (0.55, 0.72, 0.95)  # [3]
     fog: Scalar = 0.0  # [] extinction of light in the air [1/m]
     exposure: Scalar = 1.0  # [] gain of the camera
     texture_seed: Scalar = 0  # [] int: places bricks, spots and stains
@@ -285,11 +285,15 @@ def _stacked(arrays: Sequence) -> Any:
     return np.stack([np.asarray(a) for a in arrays])
 
 
-def stack_worlds(worlds: list[World]) -> World:
+def stack_worlds(worlds: list[World], multiple_of: int = 1) -> World:
     """One batch `[B, ...]` of worlds, padded to common sizes with rows and cells never met.
 
     A field is padded by repeating its edge, which is also what sampling beyond the edge of an
     unpadded one gives.
+
+    Args:
+        worlds: On the host.
+        multiple_of: The common numbers of boxes and of cylinders are rounded up to this: similar batches share programs.
 
     Raises:
         ValueError: If the list is empty, or mixes grid maps with worlds that have none.
@@ -298,7 +302,7 @@ def stack_worlds(worlds: list[World]) -> World:
         raise ValueError("stack_worlds needs at least one world.")
 
     def rows(name: str, width: int) -> Any:
-        count = max(len(getattr(w, name)) for w in worlds)
+        count = -(-max(len(getattr(w, name)) for w in worlds) // multiple_of) * multiple_of
         out = np.zeros((len(worlds), count, width), np.float32)
         out[..., :2] = FAR
         for k, w in enumerate(worlds):
@@ -306,7 +310,7 @@ def stack_worlds(worlds: list[World]) -> World:
         return out
 
     def looks(name: str) -> Any:
-        count = max(len(getattr(w, name).material) for w in worlds)
+        count = -(-max(len(getattr(w, name).material) for w in worlds) // multiple_of) * multiple_of
         filled: list[Any] = [surfaces(count) for _ in worlds]
         for out, world in zip(filled, worlds, strict=True):
             given = getattr(world, name)
