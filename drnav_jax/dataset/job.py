@@ -1,0 +1,115 @@
+"""The whole job of `drnav dataset`: what to gather, writing it, and what to show of it."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from drnav_jax import viz, worlds
+from drnav_jax.dataset import gather, shards
+from drnav_jax.dataset.behaviours import KINDS
+from drnav_jax.dataset.frames import FrameSpec
+from drnav_jax.dataset.loader import FrameSource
+from drnav_jax.dataset.shards import DatasetSpec
+
+PAGE = 14  # frames on the page of samples
+
+
+def families_of(split: str) -> tuple[str, ...]:
+    """Closed families of a split: those held out of training are in `test` only."""
+    closed = (name for name, base in worlds.FAMILIES.items() if name == base)
+    return tuple(name for name in closed if split == "test" or name not in worlds.HELD_OUT)
+
+
+def spec_of(num_frames: int, split: str, seed: int, families: tuple[str, ...] | None = None) -> DatasetSpec:
+    """What to gather.
+
+    Args:
+        num_frames: In all.
+        split: Of the worlds.
+        seed: Of all that is drawn.
+        families: Closed families; None = all of the split.
+
+    Raises:
+        ValueError: If a family is none of the split's, or a number is out of range.
+    """
+    known = families_of(split) if split in worlds.SPLITS else ()
+    spec = DatasetSpec(num_frames, split, seed, known if families is None else families)
+    for name in spec.families:
+        if name not in known:
+            raise ValueError(f'"{name}" is no closed family of the split {split}: choose from {", ".join(known)}.')
+    return spec
+
+
+def write(
+    out: Path,
+    data: DatasetSpec,
+    spec: FrameSpec = FrameSpec(),  # noqa: B008 (immutable)
+    *,
+    workers: int = 2,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Any]:
+    """Gather what is missing of a dataset; its manifest (`shards.write`)."""
+    if workers < 1:
+        raise ValueError(f"workers must be >= 1, got {workers}.")
+    settings = {"frames": _plain(dataclasses.asdict(spec))}
+    return shards.write(out, data, settings, partial(gather.shard, data, spec), workers=workers, progress=progress)
+
+
+def _plain(tree: Any) -> Any:
+    """As JSON gives it back: tuples are lists there."""
+    if isinstance(tree, dict):
+        return {name: _plain(value) for name, value in tree.items()}
+    return [_plain(value) for value in tree] if isinstance(tree, list | tuple) else tree
+
+
+def outline(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """What is worth printing of a manifest: counts, shares, families, size."""
+    counts, frames = manifest["counts"], manifest["frames"]
+    return {
+        "frames": frames,
+        "shards": len(manifest["shards"]),
+        "bytes": sum(row["bytes"] for row in manifest["shards"]),
+        "shares": {
+            "dead_end_cells": counts["dead_end_cells"] / max(counts["cells"], 1),
+            "interior_cells": counts["interior_cells"] / max(counts["cells"], 1),
+            "unseen_cells": counts["unseen_cells"] / max(counts["cells"], 1),
+            "closed_frames": counts["closed_frames"] / frames,
+            "dead_end_frames": counts["dead_end_frames"] / frames,
+            "open_paths": counts["open_paths"] / (3 * frames),
+            "stable_paths": counts["stable_paths"] / (3 * frames),
+        },
+        "families": manifest["families"],
+        "behaviours": manifest["behaviours"],
+    }
+
+
+def table(manifest: Mapping[str, Any]) -> str:
+    """Readable text of `outline`."""
+    found = outline(manifest)
+    rows = [("frames", f"{found['frames']:,} in {found['shards']} shards, {found['bytes'] / 1e6:,.0f} MB")]
+    rows += [(name.replace("_", " "), f"{100 * share:.1f} %") for name, share in found["shares"].items()]
+    rows += [(f"family {name}", f"{count:,}") for name, count in found["families"].items()]
+    rows += [(f"behaviour {name}", f"{count:,}") for name, count in found["behaviours"].items()]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {text:>12}" for name, text in rows)
+
+
+def page(folder: Path, seed: int = 0) -> Path | None:
+    """A page of random frames of a dataset, `samples.png` in its folder; None without the `viz` extra."""
+    source = FrameSource(folder)
+    names = shards.read_manifest(folder)["spec"]["families"]
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(source))[:PAGE])
+    rows = []
+    for number in chosen:
+        frame = source[int(number)]
+        variant = "" if frame.closed or worlds.twin(names[frame.family]) is None else "-open"
+        title = f"{names[frame.family]}{variant}:{frame.seed}, {KINDS[frame.behaviour]}"
+        rows.append(frame._asdict() | {"title": title + (", dead end" if frame.dead_end_flag else "")})
+    try:
+        return viz.samples(folder / "samples.png", rows)
+    except viz.MissingExtra:
+        return None
