@@ -1,7 +1,8 @@
 """Times of the parts next to their rivals, measured in turn within one run.
 
 What is timed: the planner on a recorded drive (`bench_planning`), the LiDAR and the cameras against native MuJoCo
-(`bench_sensors`), and batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from slow code.
+(`bench_sensors`), the physics (`bench_physics`), and batched closed-loop episodes. A fixed matmul from the same run
+tells a slow hour from slow code.
 """
 
 import os
@@ -15,6 +16,7 @@ import jax
 import numpy as np
 
 from drnav_jax import evaluate, worlds
+from drnav_jax.bench_physics import physics_rates
 from drnav_jax.bench_planning import NUM_STEPS, STRIDE, record, scoring_times, tick_times
 from drnav_jax.bench_sensors import camera_against_mujoco, lidar_against_mujoco
 from drnav_jax.evaluate import Setup
@@ -78,18 +80,19 @@ def run(*, quick: bool = False) -> dict[str, Any]:
 
     Returns:
         `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `lidar`,
-        `camera`, `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
+        `camera`, `mjx`, `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
     drive = record(2 * STRIDE if quick else warm_up + 200)
     rates, error, reference = scoring_times(drive, 3 if quick else 50)
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)
     camera = camera_against_mujoco(repeats=3 if quick else 20)
+    physics = physics_rates(8, 20, 5, 1) if quick else physics_rates()
     per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
     return {
         "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error, "lidar": lidar,
-        "camera": camera, "episodes_per_s": per_second, "episodes": episodes, "reference_matmul_ms": reference,
-        "machine": machine(),
+        "camera": camera, "mjx": physics, "episodes_per_s": per_second, "episodes": episodes,
+        "reference_matmul_ms": reference, "machine": machine(),
     }  # fmt: skip
 
 
@@ -112,6 +115,11 @@ def table(result: dict[str, Any]) -> str:
         ("LiDAR 16x360, 100 obstacles", f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo"),
         ("  against MuJoCo", f"max error {lidar['max_error_m']:.1e} m"),
         ("camera 96x96, 100 obstacles", f"{camera['images_per_s']:.0f} images/s, {rival}"),
+        (
+            f"MJX, {result['mjx']['worlds']} worlds of {result['mjx']['obstacles']}",
+            f"{result['mjx']['steps_per_s'] / 1e3:.0f} k steps/s, "
+            f"kinematic {result['mjx']['kinematic_steps_per_s'] / 1e6:.1f} M",
+        ),
         ("episodes of 600 steps", f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call)"),
         ("matmul 1024^3 float32", f"{result['reference_matmul_ms']:.1f} ms"),
         ("machine", "{cores} x {cpu}, {device}, jax {jax}, python {python}".format(**result["machine"])),

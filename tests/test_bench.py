@@ -16,8 +16,8 @@ def result():
 
 def test_every_figure_is_there(result):
     assert set(result) == {
-        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "camera", "episodes_per_s", "episodes", "reference_matmul_ms",
-        "machine",
+        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "camera", "mjx", "episodes_per_s", "episodes",
+        "reference_matmul_ms", "machine",
     }  # fmt: skip
     assert {"median", "p95", "max", "replan_p95"} <= set(result["tick_lidar_ms"])
     assert set(result["scoring"]) == {"4096", "65536"}
@@ -33,6 +33,8 @@ def test_figures_fit_together(result):
     assert min(*result["scoring"].values(), result["episodes_per_s"], result["reference_matmul_ms"]) > 0
     lidar = result["lidar"]
     assert lidar["ratio"] == pytest.approx(lidar["rays_per_s"] / lidar["mujoco_rays_per_s"])
+    assert min(result["mjx"][k] for k in ("steps_per_s", "kinematic_steps_per_s", "native_steps_per_s")) > 0
+    assert result["mjx"]["steps_per_s"] == pytest.approx(8 * result["mjx"]["ticks_per_s"])
     camera = result["camera"]
     assert min(camera["images_per_s"], camera["matmul_ms"]) > 0
     if camera["no_mujoco"] is None:

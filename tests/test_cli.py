@@ -9,6 +9,8 @@ import pytest
 from PIL import Image
 
 from drnav_jax import cli, evaluate, report
+from drnav_jax.cli import drive
+from drnav_jax.cli.terminal import Bar
 from drnav_jax.viz import MissingExtra
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,7 +41,7 @@ def shell(*argv, **kwargs):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ("", "run, compare, bench"),
+        ("", "run, compare, worlds, dataset, bench"),
         ("drive", "Unrecognized options: drive"),
         ("run", "exactly one of"),
         ("run --wurld u:0", "perhaps you meant --world"),
@@ -96,7 +98,7 @@ def test_negative_numbers_are_values():
 
 def test_defaults_are_those_of_the_setup():
     args = cli.parse(["run", "--world", "u:0"])
-    assert cli.setups_of(args) == {"drnav": evaluate.Setup()}
+    assert drive.setups_of(args) == {"drnav": evaluate.Setup()}
     args = cli.parse(
         "compare --planners grid,dwa --predictor oracle --risk-weight 2 --horizon 3 --robot-radius 0.22 --max-speed 2 "
         "--lidar-range 6 --goal-tolerance 1 --time-limit 100 --seed 5".split()
@@ -105,7 +107,7 @@ def test_defaults_are_those_of_the_setup():
         "predictor": "oracle", "risk_weight": 2.0, "horizon": 3.0, "robot_radius": 0.22, "max_speed": 2.0,
         "lidar_range": 6.0, "goal_tolerance": 1.0, "time_limit": 100.0, "seed": 5,
     }  # fmt: skip
-    assert cli.setups_of(args) == {name: evaluate.Setup(planner=name, **common) for name in ("grid", "dwa")}
+    assert drive.setups_of(args) == {name: evaluate.Setup(planner=name, **common) for name in ("grid", "dwa")}
 
 
 @pytest.mark.parametrize("command", ["", "run", "compare", "bench"])
@@ -206,7 +208,7 @@ def test_progress_bar_on_a_terminal(monkeypatch):
 
     terminal = Terminal()
     monkeypatch.setattr(sys, "stderr", terminal)
-    bar = cli.Bar("dwa", 4)
+    bar = Bar("dwa", 4, "episodes")
     bar(0)
     bar(2)
     bar.close()

@@ -22,10 +22,12 @@ RANKS = {
     "": 3.5,
     "evaluate": 3,
     "dataset": 3,
+    "gallery": 3,
     "train": 3,
     "bench": 3,
     "bench_sensors": 3,
     "bench_planning": 3,
+    "bench_physics": 3,
     "report": 3,
     "sources": 3,
     "navigator": 2,
@@ -43,7 +45,8 @@ RANKS = {
 }
 SIDEWAYS = {
     ("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors"),
-    ("bench", "bench_planning"), ("bench_planning", "evaluate"), ("bench_planning", "bench_sensors"),
+    ("bench", "bench_planning"), ("bench", "bench_physics"), ("bench_planning", "evaluate"),
+    ("bench_planning", "bench_sensors"), ("bench_physics", "bench_sensors"),
 }  # fmt: skip
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from drnav_jax import cli
+from drnav_jax.cli import drive
 from drnav_jax.planning import PLANNERS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +37,7 @@ def test_the_commands_are_commands():
     for argv in ours:
         args = cli.parse(argv)
         assert isinstance(args, cli.Run | cli.Compare)
-        assert cli.setups_of(args) and cli.scenes_of(args)
+        assert drive.setups_of(args) and drive.scenes_of(args)
     targets = {words[1] for words in lines if words and words[0] == "make"}
     assert targets == {"demo", "test"}
 

@@ -3,5 +3,6 @@
 from drnav_jax.viz.animation import Frame, belief
 from drnav_jax.viz.look import MissingExtra
 from drnav_jax.viz.pictures import trajectories
+from drnav_jax.viz.worldview import TopView, Truth, gallery, samples, world
 
-__all__ = ["Frame", "MissingExtra", "belief", "trajectories"]
+__all__ = ["Frame", "MissingExtra", "TopView", "Truth", "belief", "gallery", "samples", "trajectories", "world"]

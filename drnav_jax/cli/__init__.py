@@ -1,0 +1,67 @@
+"""The command line `drnav`. Thin: it reads flags, calls jobs, writes files."""
+
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+import jax
+
+from drnav_jax import __version__, bench, report
+from drnav_jax.cli import data, drive
+from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Trial, Worlds, parse
+from drnav_jax.cli.terminal import INTERRUPTED, stdout_kept
+
+__all__ = ["Bench", "Command", "Compare", "Dataset", "Run", "Trial", "Worlds", "main", "parse"]
+
+
+def _measure(args: Bench) -> int:
+    with stdout_kept(args.json):
+        result = bench.run(quick=args.quick)
+    print(report.dumps(result) if args.json else report.outline(result))
+    return 0
+
+
+def _perform(args: Command) -> int:
+    match args:
+        case Run() | Compare():
+            return drive.perform(args)
+        case Worlds():
+            return data.show(args)
+        case Dataset():
+            return data.gather(args)
+        case Bench():
+            return _measure(args)
+
+
+def _cache_programs() -> None:
+    """Keep compiled programs for the next command, unless somebody has already said where."""
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(root) / "drnav_jax"
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The console script; returns the exit code (0; 2 = the user's mistake; 130 = interrupted)."""
+    argv = sys.argv[1:] if argv is None else argv
+    if argv == ["--version"]:
+        print(f"drnav {__version__}")
+        return 0
+    try:
+        args = parse(argv)
+        _cache_programs()
+        return _perform(args)
+    except SystemExit:
+        return 0
+    except KeyboardInterrupt:
+        print("drnav: interrupted.", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, OSError) as error:
+        print(f"drnav: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2

@@ -1,0 +1,178 @@
+"""`drnav run` and `drnav compare`: drive, write, print."""
+
+import dataclasses
+import math
+import re
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from drnav_jax import __version__, evaluate, report, sources
+from drnav_jax.cli.flags import Compare, Run, Trial
+from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.planning import planner
+from drnav_jax.sim import episode
+from drnav_jax.viz import MissingExtra
+from drnav_jax.worlds import Scene
+
+PICTURES = 6  # episodes that get a trajectory picture
+MAX_FRAMES = 150  # of the film
+SPEC = episode.EpisodeSpec(chunk_ticks=10)  # a frame per second; Ctrl-C is heard as often
+
+
+class Finished(NamedTuple):
+    """What came out of all planners that were driven."""
+
+    evaluations: dict[str, evaluate.Evaluation]
+    interrupted: bool
+
+
+def scenes_of(args: Trial) -> list[Scene]:
+    """The worlds and trips that the flags name; see `sources.load`."""
+    flags = {field.name: getattr(args, field.name) for field in dataclasses.fields(sources.Source)}
+    radius = args.robot_radius
+    return sources.load(sources.Source(**flags), radius, radius + evaluate.plan_margin(evaluate.NavParams()))
+
+
+def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
+    """The setup of each planner.
+
+    Raises:
+        ValueError: If a planner is unknown or named twice, or a number is out of range.
+    """
+    names = [args.planner] if isinstance(args, Run) else [name.strip() for name in args.planners.split(",")]
+    if len(set(names)) < len(names):
+        raise ValueError(f"--planners names one twice: {', '.join(names)}.")
+    same = ("predictor", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
+    common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
+    return {name: evaluate.Setup(planner=name, **common) for name in names}
+
+
+def folder_of(args: Run | Compare) -> Path:
+    """Where to write, made if need be.
+
+    Raises:
+        ValueError: If it cannot be.
+    """
+    source = args.world or str((args.map or args.barn or args.movingai or Path()).resolve().stem)
+    out = args.out or Path("results") / f"{_command(args)}-{re.sub(r'[^A-Za-z0-9._-]+', '-', source)}"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "summary.json").open("a").close()
+    except OSError as error:
+        raise ValueError(f"{out}: cannot be written to ({error.strerror}); choose another --out.") from None
+    return out
+
+
+def _command(args: Run | Compare) -> str:
+    return "run" if isinstance(args, Run) else "compare"
+
+
+def drive(trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup]) -> Finished:
+    """Drive every planner; an interrupt keeps the episodes that are finished."""
+    evaluations: dict[str, evaluate.Evaluation] = {}
+    for name, setup in setups.items():
+        bar = Bar(name, len(trips), "episodes")
+        try:
+            evaluations[name] = evaluate.evaluate(trips, setup, progress=bar, spec=SPEC)
+        except KeyboardInterrupt:
+            return Finished(evaluations, True)
+        finally:
+            bar.close()
+        if evaluations[name].interrupted:
+            return Finished(evaluations, True)
+    return Finished(evaluations, False)
+
+
+def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
+    """The JSON object: nothing in it depends on when, or how fast, it was made."""
+    flags = dataclasses.asdict(args)
+    config = {name: flags[name] for name in sorted(flags) if name not in ("out", "json", "no_pictures")}
+    rule = "6 x the optimal time, at least 60 s"
+    if args.time_limit is not None:
+        rule = f"{args.time_limit:g} s, as asked for"
+    elif args.barn is not None:
+        rule = "100 s, as BARN has it"
+    head = {
+        "command": _command(args), "version": __version__, "config": config, "time_limit_rule": rule,
+        "optimal_rule": "shortest any-angle path at the robot's radius + planning margin, over the fastest speed",
+        "interrupted": finished.interrupted,
+    }  # fmt: skip
+    each = {name: {"episodes": e.records, "summary": e.summary} for name, e in finished.evaluations.items()}
+    if isinstance(args, Run):
+        return head | each[args.planner]
+    times = {name: evaluate.times_to_goal(e) for name, e in finished.evaluations.items()}
+    return head | {"planners": each, "ratios": report.ratios(times)}
+
+
+def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], finished: Finished) -> None:
+    """Pictures of the first episodes with the belief of the first planner that has one, a film of the first episode."""
+    believers = [name for name in finished.evaluations if planner(name).risk_in_route or planner(name).exposure]
+    first = (believers or list(finished.evaluations))[0]
+    setup, evaluation = setups[first], finished.evaluations[first]
+    spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates)
+    keys = jax.random.split(jax.random.key(setup.seed), len(trips))
+    for number, k in enumerate(evaluation.kept[:PICTURES], 1):
+        trip = trips[k]
+        assert trip.scene.start is not None
+        drives = {}
+        for name, e in finished.evaluations.items():
+            if k in e.kept:
+                path = evaluate.path_driven(e.result, k, trip.scene.start)
+                drives[name] = report.Drive(path, e.records[e.kept.index(k)])
+        batch = jax.tree.map(lambda a: a[0], evaluate.episode_params([trip], setup))
+        states = episode.replay(evaluate.with_physics(SPEC, setup), evaluate.policy_of(spec), batch, keys[k])
+        path = drives[first].path
+        every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
+        believed = report.believe(states, spec.filter, path, SPEC.dt, every)
+        file = out / ("trajectory.png" if number == 1 else f"trajectory-{number}.png")
+        title = f"{trip.scene.name}: what {first} believed" if believers else f"{trip.scene.name}: what {first} saw"
+        report.picture(file, trip.scene, drives, believed, trip.path, trip.goal_tolerance, title)
+        if number == 1:
+            report.film(out / "belief.gif", trip.scene, believed, trip.goal_tolerance, setup.robot_radius)
+
+
+def perform(args: Run | Compare) -> int:
+    """Drive, write and print; the exit code.
+
+    Raises:
+        ValueError: On a user's mistake, before anything is driven.
+        OSError: If a file cannot be read or written.
+    """
+    begin = time.perf_counter()
+    setups = setups_of(args)
+    trips = evaluate.prepare(scenes_of(args), next(iter(setups.values())))
+    out = folder_of(args)
+    with stdout_kept(args.json):
+        finished = drive(trips, setups)
+    if not finished.evaluations:
+        print("drnav: interrupted before any episode was finished; nothing is written.", file=sys.stderr)
+        return INTERRUPTED
+    for old in [out / "belief.gif", *out.glob("trajectory*.png")]:
+        old.unlink(missing_ok=True)
+    result = result_of(args, finished)
+    text = report.dumps(result)
+    (out / "summary.json").write_text(text + "\n")
+    if args.json:
+        print(text, flush=True)
+    else:
+        summaries = {name: e.summary for name, e in finished.evaluations.items()}
+        print(report.table(summaries, result.get("ratios")), flush=True)
+    walls = {name: {"episodes": len(e.records), "wall_s": e.wall_s} for name, e in finished.evaluations.items()}
+    interrupted = finished.interrupted
+    if not (args.no_pictures or interrupted):
+        try:
+            with stdout_kept(args.json):
+                draw(out, trips, setups, finished)
+        except MissingExtra as error:
+            print(f"drnav: no pictures: {error}", file=sys.stderr)
+        except KeyboardInterrupt:
+            interrupted = True
+    timing = {"planners": walls, "total_s": time.perf_counter() - begin, "backend": jax.default_backend()}
+    (out / "timing.json").write_text(report.dumps(timing) + "\n")
+    note = "interrupted; what was finished is in" if interrupted else "wrote"
+    print(f"drnav: {note} {out}/", file=sys.stderr)
+    return INTERRUPTED if interrupted else 0
