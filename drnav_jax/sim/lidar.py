@@ -115,7 +115,7 @@ def _opaque(spans: Spans, opaque: Array, slope: Array, reach: Array) -> Array:
         return jnp.minimum(met, jnp.where(first < last, first, jnp.inf))
 
     met = jnp.minimum(sides[None, :], caps[:, None])
-    return jnp.maximum(each(opaque & (spans.near <= reach), nearer, met), 0.0)
+    return jnp.maximum(each(opaque & (spans.near <= reach), nearer, met, group=4), 0.0)
 
 
 def _veiled(

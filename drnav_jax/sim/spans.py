@@ -80,16 +80,32 @@ def cylinder_spans(cylinders: Array, height: Array, pose: Array, dx: Array, dy: 
     )
 
 
-def each(chosen: Bool[Array, " N"], visit: Callable[[Array, Any], Any], carry: Any) -> Any:
+def each(chosen: Bool[Array, " N"], visit: Callable[[Array, Any], Any], carry: Any, *, group: int = 1) -> Any:
     """`carry = visit(n, carry)` for each n that is chosen, in order: what is not chosen costs nothing.
 
     One solid at a time, all rays at once: the ranges stay in the first-level cache.
+
+    Args:
+        chosen: Which of N solids.
+        visit: What is done with one.
+        carry: What it is done to.
+        group: So many in one turn of the loop, which writes its result once. The last turn is filled up with the first
+            solid anew: a visit must change nothing the second time.
     """
     if chosen.shape[0] == 0:
         return carry
-    order = jnp.nonzero(chosen, size=chosen.shape[0], fill_value=0)[0].astype(jnp.int32)
-    count = jnp.sum(chosen, dtype=jnp.int32)
-    return jax.lax.fori_loop(jnp.int32(0), count, lambda k, carry: visit(order[k], carry), carry)
+    order = jnp.nonzero(chosen, size=chosen.shape[0], fill_value=-1)[0].astype(jnp.int32)
+    if group > 1:
+        order = jnp.concatenate([order, jnp.full(group - 1, -1, jnp.int32)])
+        order = jnp.where(order < 0, order[0], order)
+    turns = (jnp.sum(chosen, dtype=jnp.int32) + group - 1) // group
+
+    def turn(k: Array, carry: Any) -> Any:
+        for m in range(group):
+            carry = visit(order[group * k + m], carry)
+        return carry
+
+    return jax.lax.fori_loop(jnp.int32(0), turns, turn, carry)
 
 
 def down_drops(
