@@ -142,12 +142,13 @@ def update(
     data: Any,
     control: Float[Array, "T 2"],
     eps: Float[Array, "T 2 K"],
+    sign: Float[Array, "2"],
     pose: Float[Array, "3"],
     twist: Float[Array, "2"],
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, "T 2"], Info]:
-    """Equations (1) and (2), once. Arguments as in `plan`; the key is for the disturbances."""
-    sigma = jnp.stack([jnp.asarray(params.std_v, jnp.float32), jnp.asarray(params.std_w, jnp.float32)])
+    """Equations (1) and (2), once. Arguments as in `plan`; eps is taken times sign; the key is for the disturbances."""
+    sigma = jnp.stack([jnp.asarray(params.std_v, jnp.float32), jnp.asarray(params.std_w, jnp.float32)]) * sign
     pull = (params.gamma / sigma)[None, :]
     deviation, wanted = eps, control
     if spec.rate_space:
@@ -208,15 +209,20 @@ def plan(
     def attempt(carry: tuple) -> tuple:
         count, control, history, _ = carry
         info = None
-        for k in jax.random.split(jax.random.fold_in(key, count), spec.num_iterations):
-            key_noise, key_gains = jax.random.split(k)
-            eps = noise.draw(spec.noise, params.noise, state.bank, key_noise, spec.num_samples)
-            control, info = update(spec, params, limits, cost, data, control, eps, pose, twist, key_gains)
+        for k, (eps, sign) in enumerate(held):
+            key_gains = jax.random.fold_in(jax.random.fold_in(key, count), k)
+            sign = sign * noise.mirror(count)
+            control, info = update(spec, params, limits, cost, data, control, eps, sign, pose, twist, key_gains)
         assert info is not None
         # a sequence that collides is not built upon: the next attempt begins anew
         control, history = (jnp.where(info.failed, 0.0, a) for a in (control, history))
         return count + 1, control, history, info
 
+    # drawn here and not in the loop, which would copy the bank
+    held = [
+        noise.draw(spec.noise, params.noise, state.bank, k, spec.num_samples)
+        for k in jax.random.split(key, spec.num_iterations)
+    ]
     begin = (jnp.zeros((), jnp.int32), state.control, state.history)
     shapes = jax.eval_shape(lambda: attempt((*begin, None)))[3]
     blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)

@@ -44,6 +44,7 @@ from drnav_jax.types import GridMap, Scalar
 LETHAL, INSCRIBED, UNKNOWN = 254.0, 253.0, 255.0
 RISK_STEP = 1.0 / 65535.0
 _LOG_INSCRIBED = math.log(INSCRIBED)
+_HIT = 1e9  # added to a sum by a collision: far above what any trajectory adds up to
 
 
 class Scene(NamedTuple):
@@ -127,11 +128,10 @@ def nav2(spec: CriticSpec, num_steps: int, dt: float) -> Cost:
         dt: Their step [s].
     """
     used = frozenset(spec.critics)
-    mapped = used & {"Cost", "Obstacles", "Exposure"}
     looked_at = (num_steps - 1) // spec.cost_every + 1
 
-    def step(scene: Scene, sums: dict, m: Motion, phase: int) -> dict:
-        """Add one point to the sums of all critics."""
+    def step(scene: Scene, sums: dict, m: Motion, t: Array) -> dict:
+        """Add one point to the sums of all critics but PathAlign."""
         new, params, limits = dict(sums), scene.params, scene.limits
 
         def add(name: str, amount: Array) -> None:
@@ -152,23 +152,21 @@ def nav2(spec: CriticSpec, num_steps: int, dt: float) -> Cost:
         if "GoalAngle" in used:
             add("yaw", dt * m.w)
             add("GoalAngle", jnp.abs(geometry.wrap_angle(new["yaw"] - scene.goal_yaw)))
-        if "PathAlign" in used and phase % spec.align_every == 0:
-            new["PathAlign"] = along.step_align(scene.ahead, sums["PathAlign"], m)
         cost = risk = hit = jnp.zeros(())
-        if (mapped - {"Cost"}) or (mapped and phase % spec.cost_every == 0):
+        if used & {"Cost", "Obstacles", "Exposure"}:
             cost, risk = read(scene.words, m.x, m.y)
             hit = collides(spec, cost)
-        if "Cost" in used and phase % spec.cost_every == 0:
+        if "Cost" in used:
             plain = jnp.where(scene.ahead.length < params.cost.near_goal, 0.0, cost)
             price = jnp.where(cost >= INSCRIBED, params.cost.critical, jnp.where(cost < 1.0, 0.0, plain))
-            add("Cost", price)
-            new["Cost hit"] = sums["Cost hit"] | hit
+            looked = (t % spec.cost_every == 0).astype(jnp.float32)
+            add("Cost", looked * jnp.where(hit, _HIT, price))
         if "Obstacles" in used:
             near = cost >= 1.0
             away = (_LOG_INSCRIBED - jnp.log(greater(cost, 1.0))) / scene.inflation.scaling
-            add("raw", jnp.where(near, greater(params.obstacles.margin - away, 0.0), 0.0))
-            add("repulsion", jnp.where(near & ~sums["Obstacles hit"] & ~hit, scene.inflation.radius - away, 0.0))
-            new["Obstacles hit"] = sums["Obstacles hit"] | hit
+            raw = jnp.where(near, greater(params.obstacles.margin - away, 0.0), 0.0)
+            add("raw", jnp.where(hit, _HIT, raw))
+            add("repulsion", jnp.where(near & (new["raw"] < _HIT), scene.inflation.radius - away, 0.0))
         if "Exposure" in used:
             ds = jnp.abs(m.v) * dt
             add("arc", ds)
@@ -177,20 +175,19 @@ def nav2(spec: CriticSpec, num_steps: int, dt: float) -> Cost:
 
     def begin(scene: Scene, m: Motion) -> dict:
         zero = jnp.zeros_like(m.x)
-        none = jnp.zeros(m.x.shape, bool)
         sums: dict = {name: zero for name in used - {"PathAlign", "Obstacles"}}
         if "GoalAngle" in used:
             sums["yaw"] = zero + scene.pose[2]
-        if "Cost" in used:
-            sums["Cost hit"] = none
         if "Obstacles" in used:
-            sums |= {"raw": zero, "repulsion": zero, "Obstacles hit": none}
+            sums |= {"raw": zero, "repulsion": zero}
         if "Exposure" in used:
             sums["arc"] = zero
         if "PathAlign" in used:
             sums["PathAlign"] = along.begin_align(m)
-        first = step(scene, sums, m, 0)
-        return first | {"PathAlign": sums["PathAlign"]} if "PathAlign" in used else first
+        return step(scene, sums, m, jnp.zeros((), jnp.int32))
+
+    def seldom(scene: Scene, sums: dict, m: Motion) -> dict:
+        return sums | {"PathAlign": along.step_align(scene.ahead, sums["PathAlign"], m)}
 
     def finish(scene: Scene, sums: dict, m: Motion) -> Priced:
         params, ahead = scene.params, scene.ahead
@@ -207,11 +204,12 @@ def nav2(spec: CriticSpec, num_steps: int, dt: float) -> Cost:
             if name == "Constraint":
                 term, of = sum_, params.constraint
             elif name == "Cost":
-                hit = hit | sums["Cost hit"]
-                term, of = jnp.where(sums["Cost hit"], params.cost.collision, sum_) / (254.0 * looked_at), params.cost
+                hit = hit | (sum_ >= _HIT)
+                term = jnp.where(sum_ >= _HIT, params.cost.collision, sum_) / (254.0 * looked_at)
+                of = params.cost
             elif name == "Obstacles":
-                hit, of = hit | sums["Obstacles hit"], Weight(1.0, params.obstacles.power)
-                raw = jnp.where(sums["Obstacles hit"], params.obstacles.collision, sums["raw"])
+                hit, of = hit | (sums["raw"] >= _HIT), Weight(1.0, params.obstacles.power)
+                raw = jnp.where(sums["raw"] >= _HIT, params.obstacles.collision, sums["raw"])
                 rep = jnp.where(left < params.obstacles.near_goal, 0.0, sums["repulsion"])
                 term = params.obstacles.critical * raw + params.obstacles.repulsion * mean * (rep - jnp.min(rep))
             elif name == "Goal":
@@ -235,4 +233,6 @@ def nav2(spec: CriticSpec, num_steps: int, dt: float) -> Cost:
             terms.append(jnp.power(of.weight * term, of.power))
         return Priced(functools.reduce(jnp.add, terms), jnp.stack(terms), hit)
 
-    return Cost(begin=begin, step=step, finish=finish, period=math.lcm(spec.cost_every, spec.align_every))
+    return Cost(
+        begin=begin, step=step, finish=finish, seldom=seldom if "PathAlign" in used else None, period=spec.align_every
+    )

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from drnav_jax import geometry
+from drnav_jax import geometry, grids
 from drnav_jax.planning import path as paths
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.planning.mppi_critic_params import AlignParams, AngleParams, FollowParams
@@ -71,7 +71,7 @@ def begin_align(m: Motion) -> Aligned:
 def step_align(ahead: Ahead, carry: Aligned, m: Motion) -> Aligned:
     """At each further point that is looked at."""
     arc = carry.arc + jnp.sqrt(jnp.square(m.x - carry.x) + jnp.square(m.y - carry.y))
-    at = jnp.searchsorted(ahead.middle, arc, side="right", method="scan_unrolled")
+    at = grids.once(jnp.searchsorted(ahead.middle, arc, side="right", method="scan_unrolled"))
     read = lambda a: a.at[at].get(mode="promise_in_bounds")  # noqa: E731
     away = jnp.sqrt(jnp.square(read(ahead.path.x) - m.x) + jnp.square(read(ahead.path.y) - m.y))
     free = jnp.where(read(ahead.blocked), 0.0, 1.0)

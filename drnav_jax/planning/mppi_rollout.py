@@ -10,7 +10,8 @@ So Nav2 takes it that a command acts a step after it was sent, and it sends the 
 commands act at once: v_t = clip(c_t, ...) from v_{-1} measured.
 
 What bounds it: one table look-up per sample and step, if the cost has one. State is a structure of `[K]` arrays carried by
-a scan, the heading turns by a polynomial, and costs accumulate while rolling out, so nothing of size T x K is written.
+a scan, the heading turns by a polynomial, and costs accumulate while rolling out, so nothing of size T x K is written. No
+two steps are written out one after the other: XLA on a CPU would compute the first anew for each use in the second.
 """
 
 import dataclasses
@@ -56,14 +57,16 @@ class Cost:
 
     Attributes:
         begin: (data, motion at t = 0) -> carry.
-        step: (data, carry, motion at t, t modulo period as a Python integer) -> carry.
+        step: (data, carry, motion at t, t) -> carry, for t = 1..T - 1.
         finish: (data, carry, motion at T - 1) -> Priced.
-        period: After how many steps `step` does the same again.
+        seldom: (data, carry, motion) -> carry, after `step` at every multiple of `period`; for what is dear.
+        period: See `seldom`.
     """
 
     begin: Callable[[Any, Motion], Any]
-    step: Callable[[Any, Any, Motion, int], Any]
+    step: Callable[[Any, Any, Motion, Array], Any]
     finish: Callable[[Any, Any, Motion], Priced]
+    seldom: Callable[[Any, Any, Motion], Any] | None = None
     period: int = 1
 
 
@@ -74,14 +77,15 @@ def running(price: Callable[[Any, Motion], Array]) -> Cost:
         del data, motion
         return Priced(total, total[None], jnp.zeros(total.shape, bool))
 
-    return Cost(begin=price, step=lambda data, total, m, _: total + price(data, m), finish=finish, period=4)
+    return Cost(begin=price, step=lambda data, total, m, _: total + price(data, m), finish=finish)
 
 
 def reachable(v: Array, target: Array, up: Scalar, down: Scalar) -> Array:
     """Equation (1): `target`, as far as v gets towards it by changes of at most `up` and `down` (> 0) [m/s]."""
-    forward = v > 0
-    lower, upper = v - jnp.where(forward, down, up), v + jnp.where(forward, up, down)
-    return dynamics.lesser(dynamics.greater(target, lower), upper)
+    # both answers, then the choice: choosing between two scalars first makes the whole rollout twice as slow
+    forward = dynamics.lesser(dynamics.greater(target, v - down), v + up)
+    backward = dynamics.lesser(dynamics.greater(target, v - up), v + down)
+    return jnp.where(v > 0, forward, backward)
 
 
 def rollout(
@@ -131,11 +135,12 @@ def rollout(
         c = jnp.tile(c, (1, copies)) if copies > 1 else c
         return reachable(v, c[0], up, down), dynamics.approach(w, c[1], turn)
 
-    def step(carry: tuple, u: Array, eps: Array, phase: int) -> tuple:
+    def step(carry: tuple, now: tuple[Array, Array, Array]) -> tuple[tuple, None]:
         m, v, w, costs = carry
+        u, eps, t = now
         v, w = speeds(v, w, u, eps)
         m = drive(m, v, w)
-        return m, v, w, cost.step(data, costs, m, phase)
+        return (m, v, w, cost.step(data, costs, m, t)), None
 
     begin = dynamics.start(pose, twist, num * copies)
     v, w = begin.v, begin.w
@@ -144,16 +149,18 @@ def rollout(
         control, deviation = control[1:], deviation[1:]
     first = drive(begin, v, w)
     carry = (first, v, w, cost.begin(data, first))
-    period = cost.period
-    blocks = (num_steps - 1) // period
+    steps = num_steps - 1
+    inputs = (control[:steps], deviation[:steps], jnp.arange(1, num_steps))
+    blocks = 0 if cost.seldom is None else steps // cost.period
 
-    def block(carry: tuple, part: tuple[Array, Array]) -> tuple[tuple, None]:
-        for k in range(period):
-            carry = step(carry, part[0][k], part[1][k], (k + 1) % period)
-        return carry, None
+    def block(carry: tuple, part: tuple[Array, Array, Array]) -> tuple[tuple, None]:
+        m, v, w, costs = jax.lax.scan(step, carry, part)[0]
+        assert cost.seldom is not None
+        return (m, v, w, cost.seldom(data, costs, m)), None
 
-    fold = lambda a: a[: blocks * period].reshape(blocks, period, *a.shape[1:])  # noqa: E731
-    carry, _ = jax.lax.scan(block, carry, (fold(control), fold(deviation)))
-    for t in range(blocks * period, num_steps - 1):
-        carry = step(carry, control[t], deviation[t], (t + 1) % period)
+    if blocks:
+        whole = jax.tree.map(lambda a: a[: blocks * cost.period].reshape(blocks, cost.period, *a.shape[1:]), inputs)
+        carry, _ = jax.lax.scan(block, carry, whole)
+    if steps > blocks * cost.period or not blocks:
+        carry, _ = jax.lax.scan(step, carry, jax.tree.map(lambda a: a[blocks * cost.period :], inputs))
     return cost.finish(data, carry[3], carry[0])

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from drnav_jax.types import Scalar
 
@@ -114,8 +114,8 @@ def fill(
 
 def draw(
     spec: NoiseSpec, params: NoiseParams, bank: Float[Array, "T 2 B"], key: PRNGKeyArray, num_samples: int
-) -> Float[Array, "T 2 K"]:
-    """K sequences out of the bank, or fresh ones if there is none.
+) -> tuple[Float[Array, "T 2 K"], Float[Array, "2"]]:
+    """K sequences out of the bank, or fresh ones if there is none, and the sign to take each axis with.
 
     Args:
         spec: Which noise.
@@ -126,7 +126,7 @@ def draw(
     """
     num_steps, _, held = bank.shape
     if not held:
-        return sample(spec, params, key, num_steps, num_samples)
+        return sample(spec, params, key, num_steps, num_samples), jnp.ones(2, jnp.float32)
     key_place, key_sign = jax.random.split(key)
     # an antithetic bank keeps its pairs together: a stretch of the first half and the same stretch of the second
     half = num_samples // 2 if spec.antithetic else num_samples
@@ -135,4 +135,9 @@ def draw(
     sign = jnp.where(jax.random.bernoulli(key_sign, 0.5, (2,)), 1.0, -1.0).astype(jnp.float32)
     take = lambda begin, size: jax.lax.dynamic_slice_in_dim(bank, begin, size, axis=2)  # noqa: E731
     parts = [take(place, half), take(place + width, num_samples - half)] if spec.antithetic else [take(place, half)]
-    return jnp.concatenate(parts, axis=2) * sign[None, :, None]
+    return jnp.concatenate(parts, axis=2), sign  # multiplying would take as long as a rollout
+
+
+def mirror(attempt: Int[Array, ""]) -> Float[Array, "2"]:
+    """Signs that make other sequences of the same: none changed at attempt 0, then omega's, v's, both."""
+    return jnp.stack([1 - 2 * ((attempt // 2) % 2), 1 - 2 * (attempt % 2)]).astype(jnp.float32)

@@ -63,8 +63,8 @@ def draws(seed=0):
     return u, rng.normal(size=(STEPS, 2, SAMPLES)).astype(np.float32)
 
 
-def update(u, eps, spec=PLAIN, params=PARAMS, key=KEY):
-    return mppi.update(spec, params, LIMITS, COST, f32(GOAL), f32(u), f32(eps), f32(POSE), f32(TWIST), key)
+def update(u, eps, spec=PLAIN, params=PARAMS, key=KEY, sign=(1, 1)):
+    return mppi.update(spec, params, LIMITS, COST, f32(GOAL), f32(u), f32(eps), f32(sign), f32(POSE), f32(TWIST), key)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,6 +79,15 @@ def test_the_update_is_that_of_the_loops(seed):
     best = int(info.best_index[0])
     assert float(info.best[0, 0]) == pytest.approx(costs[0, best], rel=CLOSE)
     assert not bool(info.failed)
+
+
+@pytest.mark.parametrize("rate_space", [False, True])
+def test_signs_are_those_of_the_noise(rate_space):
+    spec, params = dataclasses.replace(PLAIN, rate_space=rate_space), PARAMS._replace(change=2.0)
+    u, eps = draws(8)
+    want, _ = update(u, eps * np.float32([1, -1])[None, :, None], spec, params)
+    got, _ = update(u, eps, spec, params, sign=(1, -1))
+    np.testing.assert_allclose(got, want, rtol=CLOSE, atol=CLOSE)
 
 
 def test_the_update_is_pytorch_mppis():
@@ -111,7 +120,7 @@ def test_the_update_is_pytorch_mppis():
     controller.command(torch.tensor([*POSE, *TWIST], dtype=torch.float64), shift_nominal_trajectory=False)
     only_distance = mppi_rollout.running(lambda goal, m: jnp.sqrt(jnp.square(m.x - goal[0]) + jnp.square(m.y - goal[1])))
     got, _ = mppi.update(
-        PLAIN, params, LIMITS, only_distance, f32(GOAL), f32(u), f32(eps), f32(POSE), f32(TWIST), KEY
+        PLAIN, params, LIMITS, only_distance, f32(GOAL), f32(u), f32(eps), f32([1, 1]), f32(POSE), f32(TWIST), KEY
     )
     np.testing.assert_allclose(got, controller.U.numpy(), rtol=CLOSE, atol=CLOSE)
 
@@ -130,9 +139,8 @@ def test_one_command_smooths_clamps_sends_the_second_and_shifts():
     history = np.random.default_rng(3).normal(0, 0.1, (4, 2)).astype(np.float32)
     state = mppi.init(spec, PARAMS, KEY)._replace(control=f32(u), history=f32(history))
     after, command, _ = plan(spec, PARAMS, LIMITS, COST, f32(GOAL), state, f32(POSE), f32(TWIST), KEY)
-    key, key_gains = jax.random.split(jax.random.split(jax.random.fold_in(KEY, 0), 1)[0])
-    eps = noise.draw(spec.noise, PARAMS.noise, state.bank, key, SAMPLES)
-    updated, _ = update(u, eps, key=key_gains)
+    eps, _ = noise.draw(spec.noise, PARAMS.noise, state.bank, jax.random.split(KEY, 1)[0], SAMPLES)
+    updated, _ = update(u, eps)
     padded = np.concatenate([history, updated, np.repeat(updated[-1:], 4, axis=0)])
     smooth = np.concatenate([signal.savgol_filter(padded, 9, 2, axis=0)[4:-5], updated[-1:]])
     want = reference.mppi_clamp(smooth, TWIST, LIMITS, DT)
@@ -146,7 +154,7 @@ def test_all_colliding_is_tried_again_then_fails_and_forgets():
         del carry
         return Priced(m.x * 0.0, (m.x * 0.0)[None], jnp.broadcast_to(data, m.x.shape))
 
-    cost = mppi_rollout.Cost(begin=lambda d, m: m.x, step=lambda d, c, m, p: c, finish=finish)
+    cost = mppi_rollout.Cost(begin=lambda d, m: m.x, step=lambda d, c, m, t: c, finish=finish)
     u, _ = draws()
     state = mppi.init(PLAIN, PARAMS, KEY)._replace(control=f32(u), history=jnp.ones((4, 2)))
     for hits in (True, False):

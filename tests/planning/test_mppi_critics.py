@@ -73,7 +73,9 @@ def price(spec, scene, runs):
     cost = mppi_critics.nav2(spec, STEPS, DT)
     carry = cost.begin(scene, motion[0])
     for t in range(1, STEPS):
-        carry = cost.step(scene, carry, motion[t], t % cost.period)
+        carry = cost.step(scene, carry, motion[t], jnp.asarray(t))
+        if cost.seldom is not None and t % cost.period == 0:
+            carry = cost.seldom(scene, carry, motion[t])
     return cost.finish(scene, carry, motion[-1])
 
 
@@ -189,27 +191,29 @@ def test_rollouts_are_those_of_the_loops():
         del data
         return jnp.stack([m.x, m.y, jnp.arctan2(m.s, m.c), m.v, m.w])
 
-    def record(data, carry, m, phase):
-        """Every pose, at the place that a counter tells."""
-        del phase
-        k, seen = carry
-        return k + 1, seen.at[k].set(path_of(data, m))
+    def record(data, seen, m, t):
+        return seen.at[t].set(path_of(data, m))
 
     def begin(data, m):
-        return record(data, (jnp.asarray(0, jnp.int32), jnp.zeros((STEPS, 5, m.x.shape[0]))), m, 0)
+        return record(data, jnp.zeros((STEPS, 5, m.x.shape[0])), m, 0)
+
+    def seldom(data, seen, m):
+        """Counts its calls in the yaw of the first pose."""
+        return seen.at[0, 2].add(1.0)
 
     def finish(data, carry, m):
         del data, m
-        seen = carry[1].reshape(STEPS * 5, -1)
+        seen = carry.reshape(STEPS * 5, -1)
         return mppi_rollout.Priced(seen[0], seen, seen[0] < 0)
 
-    cost = mppi_rollout.Cost(begin=begin, step=record, finish=finish, period=4)
+    cost = mppi_rollout.Cost(begin=begin, step=record, finish=finish, seldom=seldom, period=4)
     gains = np.array([[1.0, 0.9], [1.0, 1.2]])
     for with_gains in (None, f32(gains)):
         got = mppi_rollout.rollout(
             cost, None, LIMITS, f32(pose), f32(twist), f32(control), f32(eps), f32(sigma), dt=DT, gains=with_gains
         )
-        got = np.asarray(got.terms).reshape(STEPS, 5, -1)
+        got = np.array(got.terms).reshape(STEPS, 5, -1)
+        got[0, 2] -= (STEPS - 1) // 4
         c = np.float32(control)[:, :, None] + np.float32(sigma)[None, :, None] * np.float32(eps)
         for k in range(SAMPLES):
             want = np.stack(reference.mppi_rollout(pose, twist, c[:, :, k], LIMITS, DT))

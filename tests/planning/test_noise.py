@@ -61,26 +61,32 @@ def test_a_bank_gives_stretches_of_itself_with_either_sign(antithetic):
     spec = NoiseSpec(antithetic=antithetic, bank=50)
     bank = noise.fill(spec, NoiseParams(), KEY, STEPS, 20)
     assert bank.shape == (STEPS, 2, 50)
-    held, seen = np.asarray(bank), set()
+    held, seen, signs = np.asarray(bank), set(), set()
     for k in range(40):
-        eps = np.asarray(noise.draw(spec, NoiseParams(), bank, jax.random.key(k), 20))
+        eps, sign = map(np.asarray, noise.draw(spec, NoiseParams(), bank, jax.random.key(k), 20))
+        signs.add(tuple(sign.tolist()))
         assert eps.shape == (STEPS, 2, 20)
-        for j in range(20):  # each column is one of the bank's, up to the sign of each axis
-            match = [np.abs(np.abs(held[:, a]) - np.abs(eps[:, a, j : j + 1])).max(axis=0).argmin() for a in (0, 1)]
-            assert match[0] % (25 if antithetic else 50) == match[1] % (25 if antithetic else 50)
+        for j in range(20):
+            assert (np.abs(held - eps[:, :, j : j + 1]).max(axis=(0, 1)) == 0).any(), "each column is one of the bank's"
         if antithetic:
             np.testing.assert_array_equal(eps[:, :, 10:], -eps[:, :, :10])
         seen.add(eps[0, 0, 0])
-    assert len(seen) > 15
+    assert len(seen) > 10 and signs == {(a, b) for a in (-1.0, 1.0) for b in (-1.0, 1.0)}
 
 
 def test_without_a_bank_every_draw_is_fresh():
     spec = NoiseSpec()
     bank = noise.fill(spec, NoiseParams(), KEY, STEPS, 20)
     assert bank.shape == (STEPS, 2, 0)
-    a, b = (noise.draw(spec, NoiseParams(), bank, jax.random.key(k), 20) for k in (0, 1))
+    (a, sign), (b, _) = (noise.draw(spec, NoiseParams(), bank, jax.random.key(k), 20) for k in (0, 1))
+    np.testing.assert_array_equal(sign, [1, 1])
     assert float(jnp.abs(a - b).min()) > 0
     np.testing.assert_array_equal(a, noise.sample(spec, NoiseParams(), jax.random.key(0), STEPS, 20))
+
+
+def test_mirrors_are_four_different_pairs_of_signs():
+    signs = [tuple(np.asarray(noise.mirror(jnp.asarray(k))).tolist()) for k in range(5)]
+    assert signs[0] == signs[4] == (1.0, 1.0) and len(set(signs)) == 4
 
 
 def test_what_cannot_be_is_refused():
