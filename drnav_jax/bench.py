@@ -17,7 +17,7 @@ import numpy as np
 
 from drnav_jax import evaluate, worlds
 from drnav_jax.bench_physics import physics_rates
-from drnav_jax.bench_planning import NUM_STEPS, STRIDE, record, scoring_times, tick_times
+from drnav_jax.bench_planning import NUM_STEPS, STRIDE, parts, record, scoring_times, tick_times
 from drnav_jax.bench_sensors import camera_against_mujoco, lidar_against_mujoco
 from drnav_jax.evaluate import Setup
 from drnav_jax.sim import episode
@@ -79,7 +79,8 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         quick: Few repeats and short episodes: the same keys in less time, figures that mean little.
 
     Returns:
-        `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `lidar`,
+        `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `plan_ms` (goal
+        generator with 4,096 candidates and DWA), `cost_to_go_ms` (256x256), `planning` (`bench_planning.parts`), `lidar`,
         `camera`, `mjx`, `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
@@ -89,9 +90,11 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     camera = camera_against_mujoco(repeats=3 if quick else 20)
     physics = physics_rates(8, 20, 5, 1) if quick else physics_rates()
     per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
+    planning = parts(drive, quick=quick)
     return {
-        "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error, "lidar": lidar,
-        "camera": camera, "mjx": physics, "episodes_per_s": per_second, "episodes": episodes,
+        "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error,
+        "plan_ms": planning["plan"]["both"], "cost_to_go_ms": planning["cost_to_go"]["full"], "planning": planning,
+        "lidar": lidar, "camera": camera, "mjx": physics, "episodes_per_s": per_second, "episodes": episodes,
         "reference_matmul_ms": reference, "machine": machine(),
     }  # fmt: skip
 
@@ -101,6 +104,7 @@ def table(result: dict[str, Any]) -> str:
     tick, error, lidar, camera, episodes = (
         result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "camera", "episodes")
     )
+    plan, route = (result["planning"][k] for k in ("plan", "cost_to_go"))
     rival = camera["no_mujoco"] or f"{camera['ratio']:.1f} x MuJoCo"
     rates = {f"scoring, {int(n):,} x {NUM_STEPS}": rate for n, rate in result["scoring"].items()}
     rows = [
@@ -111,6 +115,12 @@ def table(result: dict[str, Any]) -> str:
             "  against bilinear",
             f"{100 * error['median_relative']:.2f} % median, {100 * error['p95_relative']:.2f} % p95; "
             f"its choices cost {100 * error['median_regret_m']:.1f} cm more (median)",
+        ),
+        ("goal generator + DWA", f"{result['plan_ms']:.2f} ms ({plan['generator']:.2f} + {plan['tracker']:.2f})"),
+        (
+            "cost-to-go, 256x256",
+            f"{result['cost_to_go_ms']:.1f} ms; {route['window']:.1f} on coarser cells, within "
+            f"{100 * route['median_error']:.2f} % (median); {route['serpentine']:.1f} through a serpentine",
         ),
         ("LiDAR 16x360, 100 obstacles", f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo"),
         ("  against MuJoCo", f"max error {lidar['max_error_m']:.1e} m"),

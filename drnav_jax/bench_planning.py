@@ -13,12 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax import evaluate, geometry, navigator, worlds
+from drnav_jax import evaluate, geometry, grids, navigator, worlds
 from drnav_jax.bench_sensors import interleaved
 from drnav_jax.evaluate import Setup
 from drnav_jax.navigator import NavParams, NavSpec, NavState
-from drnav_jax.planning import costmap, goal_generator, scoring
+from drnav_jax.planning import costmap, goal_generator, route, scoring, tracker
 from drnav_jax.planning.goal_generator import GeneratorSpec
+from drnav_jax.planning.route import RouteSpec
 from drnav_jax.sim import LidarParams, LidarSpec, kinematic, scan
 from drnav_jax.types import GridMap, Observation, empty_observation
 
@@ -26,6 +27,7 @@ DRIVE = "t"  # family whose world is driven for the recording: corridors, a fork
 STRIDE = 20  # ticks of the drive between two places at which candidates are scored
 NUM_STEPS = 56  # T of the scoring
 THREADS = {4096: 1, 65536: 2}  # that share so many candidates
+COUNTS, LENGTHS = (1024, 4096, 16384, 65536), (14, 28, 56, 112)  # K and T of the scaling
 
 
 class Drive(NamedTuple):
@@ -186,3 +188,99 @@ def _difference(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
         "median_regret_m": float(np.median([best - smooth.min() for best, smooth in free])),
         "max_regret_m": float(np.max([best - smooth.min() for best, smooth in free])),
     }
+
+
+def plan_times(drive: Drive, repeats: int) -> dict[str, float]:
+    """Times [ms] of the goal generator with 4,096 candidates, of the DWA that tracks its goal, and of both (`plan_ms`)."""
+    spec, params = drive.spec, drive.params
+    generator = GeneratorSpec(num_speeds=16, num_turns=240, num_headings=256)
+    seen, state = drive.stops[-1]
+    clear, words = jax.jit(navigator.rollout_field, static_argnums=0)(spec, params, state)
+    twist, no = jnp.asarray([0.6, 0.4], jnp.float32), jnp.asarray(False)
+    hysteresis = jnp.asarray(params.hysteresis, jnp.float32)
+
+    def generate() -> jax.Array:
+        return goal_generator.generate(
+            generator, params.score, params.robot, words, seen.pose, twist, seen.goal, state.local_goal, hysteresis
+        ).xy
+
+    def track(target: jax.Array) -> tracker.Track:
+        return tracker.track(spec.tracker, params.tracker, params.robot, clear, seen.pose, twist, target, no)
+
+    last = generate()
+    spent = interleaved([generate, lambda: track(last), lambda: track(generate())], repeats)
+    return dict(zip(("generator", "tracker", "both"), (1e3 * s for s in spent), strict=True))
+
+
+def serpentine(size: int = 256, pitch: int = 20, gap: int = 16) -> tuple[np.ndarray, np.ndarray]:
+    """Cell costs and values to start from of a way that turns back at every wall: the most rounds for the fewest cells."""
+    cost, initial = np.ones((size, size), np.float32), np.full((size, size), grids.UNREACHABLE, np.float32)
+    for k, row in enumerate(range(pitch, size - pitch // 2, pitch)):
+        cost[row : row + 2, slice(0, size - gap) if k % 2 else slice(gap, size)] = grids.UNREACHABLE
+    initial[0, 0] = 0.0
+    return cost, initial
+
+
+def route_times(drive: Drive, repeats: int) -> dict[str, float]:
+    """Cost-to-go of the window of a drive: times [ms], and what coarser cells change.
+
+    Returns:
+        `window`: the route as the navigator solves it (`RouteSpec.pooling`), `full`: on the map's own cells, both with all
+        that makes the costs; `serpentine`: the bare solver, 256x256 cells, where sweeping is at its worst. `median_error`
+        and `p95_error` of `window` relative to `full`, on cells from which both find a way.
+    """
+    spec, params, cell = drive.spec, drive.params, drive.spec.filter.grid.resolution
+    seen, state = drive.stops[-1]
+    window = geometry.window_origin(state.belief.corner, spec.filter.grid)
+    local = navigator.belief.local_map(spec.filter, state.belief)
+    clear = costmap.clearance(local.seen & (local.occupancy > 0), cell)
+    rows, cols = spec.filter.grid.shape
+
+    def solve(how: RouteSpec) -> jax.Array:
+        beyond = jnp.zeros((rows // how.pooling, cols // how.pooling), jnp.float32)  # no more than the straight distance
+        return route.solve(
+            how, params.route, clear, state.risk, state.recovery.visits, window, cell, seen.pose[:2], seen.goal,
+            params.robot, jnp.asarray(False), beyond,
+        ).value  # fmt: skip
+
+    ways = (spec.route, RouteSpec(pooling=1, max_iterations=spec.route.max_iterations))
+    cost, initial = jax.tree.map(jnp.asarray, serpentine())
+    turning = lambda: grids.cost_to_go(cost, initial, resolution=cell)  # noqa: E731
+    spent = interleaved([*(functools.partial(solve, how) for how in ways), turning], repeats)
+    coarse, fine = (np.asarray(solve(how), float) for how in ways)
+    both = (np.maximum(coarse, fine) < 0.5 * grids.UNREACHABLE) & (fine > 1.0)
+    error = np.abs(coarse[both] / fine[both] - 1.0)
+    return {
+        **dict(zip(("window", "full", "serpentine"), (1e3 * s for s in spent), strict=True)),
+        "median_error": float(np.median(error)), "p95_error": float(np.percentile(error, 95)),
+    }  # fmt: skip
+
+
+def scaling(drive: Drive, repeats: int, counts: tuple[int, ...] = COUNTS, lengths: tuple[int, ...] = LENGTHS) -> dict:
+    """Times [ms] of the scoring kernel, on one thread: over K at T = `NUM_STEPS`, over T at K = 4,096."""
+    seen, state = drive.stops[0]
+    words = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, drive.params, state)[1]
+
+    def call(num: int, steps: int) -> Callable[[], scoring.Scores]:
+        chosen = _candidates(drive.params, seen, state, num)
+        params = drive.params.score._replace(horizon=jnp.asarray(0.1 * steps, jnp.float32))
+        return lambda: scoring.score(words, chosen, params, drive.params.robot, dt=0.1, num_steps=steps)
+
+    spent = interleaved(
+        [*(call(num, NUM_STEPS) for num in counts), *(call(4096, steps) for steps in lengths)], repeats
+    )
+    times = [1e3 * s for s in spent]
+    return {
+        "candidates": dict(zip(map(str, counts), times[: len(counts)], strict=True)),
+        "steps": dict(zip(map(str, lengths), times[len(counts) :], strict=True)),
+    }
+
+
+def parts(drive: Drive, *, quick: bool = False) -> dict[str, Any]:
+    """`plan_times`, `route_times`, `scaling` (of fewer counts and lengths if `quick`) and `threads` by candidates."""
+    repeats, few = (3, slice(2)) if quick else (30, slice(None))
+    return {
+        "plan": plan_times(drive, repeats), "cost_to_go": route_times(drive, repeats),
+        "scaling": scaling(drive, repeats // 3, COUNTS[few], LENGTHS[few]),
+        "threads": {str(num): workers for num, workers in THREADS.items()},
+    }  # fmt: skip

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from drnav_jax import bench, bench_planning
+from drnav_jax import bench, bench_planning, grids
 from drnav_jax.planning import scoring
 
 
@@ -16,11 +16,12 @@ def result():
 
 def test_every_figure_is_there(result):
     assert set(result) == {
-        "tick_lidar_ms", "scoring", "scoring_error", "lidar", "camera", "mjx", "episodes_per_s", "episodes",
-        "reference_matmul_ms", "machine",
+        "tick_lidar_ms", "scoring", "scoring_error", "plan_ms", "cost_to_go_ms", "planning", "lidar", "camera", "mjx",
+        "episodes_per_s", "episodes", "reference_matmul_ms", "machine",
     }  # fmt: skip
     assert {"median", "p95", "max", "replan_p95"} <= set(result["tick_lidar_ms"])
-    assert set(result["scoring"]) == {"4096", "65536"}
+    assert set(result["scoring"]) == set(result["planning"]["threads"]) == {"4096", "65536"}
+    assert set(result["planning"]) == {"plan", "cost_to_go", "scaling", "threads"}
     assert {"rays_per_s", "mujoco_rays_per_s", "ratio", "max_error_m"} <= set(result["lidar"])
     assert set(result["camera"]) == {"images_per_s", "mujoco_images_per_s", "ratio", "no_mujoco", "matmul_ms"}
     assert {"cores", "cpu", "jax", "platform", "python"} <= set(result["machine"])
@@ -42,6 +43,21 @@ def test_figures_fit_together(result):
     else:
         assert "libegl1" in camera["no_mujoco"] and camera["ratio"] is camera["mujoco_images_per_s"] is None
     assert lidar["max_error_m"] < 1e-3 and lidar["mismatches"] == 0
+
+
+def test_parts_of_the_planner_fit_together(result):
+    plan, route, scaling = (result["planning"][k] for k in ("plan", "cost_to_go", "scaling"))
+    assert result["plan_ms"] == plan["both"] and result["cost_to_go_ms"] == route["full"]
+    assert min(*plan.values(), *route.values(), *scaling["candidates"].values(), *scaling["steps"].values()) > 0
+    assert set(scaling["candidates"]) == {"1024", "4096"} and set(scaling["steps"]) == {"14", "28"}
+    assert route["median_error"] < 0.02 and route["p95_error"] < 0.1
+
+
+def test_a_serpentine_has_one_long_way():
+    cost, initial = bench_planning.serpentine(128)
+    value = np.asarray(grids.cost_to_go(cost, initial, resolution=0.1))
+    assert (value[cost < grids.UNREACHABLE] < grids.UNREACHABLE).all()
+    assert value[-1, -1] > 36.0  # as the crow flies: 18 m
 
 
 def test_nobody_arrives_before_the_time_is_up(result):
