@@ -27,8 +27,8 @@ class Trial:
     """What is driven, where and with what.
 
     Attributes:
-        world: Seeded family of worlds: open, u, corridor, t, l, or an open twin such as u-open. With --episodes N the
-            worlds of SEED to SEED+N-1.
+        world: Seeded family of worlds: open, u, corridor, t, t-both, l, lobby, room, glass, dock, cars, trail, field,
+            maze, office, site, or an open twin such as u-open. With --episodes N the worlds of SEED to SEED+N-1.
         map: map_server yaml; or, with --resolution, an image of a floor plan: light = free, a light outside is filled.
         barn: BARN .world file, or a folder of them; brings its own start, goal, tolerance and time limit.
         movingai: Moving AI .map file. Trips of FILE.scen if it is there, else sampled ones.

@@ -3,7 +3,7 @@
 All of it is drawn from generators of their own, one for the place and one for each role, so that neither the geometry
 nor the other twin's solids change what a seed looks like:
 
-    colour = clip(one of the material's colours * (1 + gain) + tint, 0.03, 0.95),   gain, tint ~ U(-s, s)    (1)
+    colour = clip(one of the material's colours * (1 + gain) + tint / 2, 0.03, 0.95),   gain, tint ~ U(-s, s)    (1)
 
 with the spread s of the split. Nothing here depends on whether a way is open.
 """
@@ -124,8 +124,8 @@ SETTINGS: dict[str, Setting] = {
 def _colour(material: M, spread: float, rng: np.random.Generator) -> np.ndarray:
     """Equation 1."""
     base = np.array(COLOURS[material][rng.integers(len(COLOURS[material]))])
-    gain, tint = rng.uniform(-spread, spread), rng.uniform(-spread, spread, 3) / 2
-    return np.clip(base * (1 + gain) + tint, 0.03, 0.95)
+    gain, tint = rng.uniform(-spread, spread), rng.uniform(-spread, spread, 3)
+    return np.clip(base * (1 + gain) + tint / 2, 0.03, 0.95)
 
 
 def _generator(key: Sequence[int], role: str) -> np.random.Generator:

@@ -106,16 +106,18 @@ def _room(draw: Draw, rng: np.random.Generator) -> Layout:
     hull = _hull(aside + h, far, top, rng)
     free = [*ways.free, (at + run, -d, near, d), (near, low, back, high), *out]
     frame = "frame"
+    blocked = block(hull, free, rng)
+    # The first door stands open, into the room, to either side.
+    side = -1 if rng.random() < 0.5 else 1
+    lean = rng.uniform(-45, -5) if side < 0 else rng.uniform(5, 45)
+    first = leaf((near + 0.03, side * d), math.radians(lean), door, "leaf")
     solids = [
-        *block(hull, free, rng),
+        *blocked,
         *portal(near - thick / 2, 0.0, True, door, frame, 0.06, thick + 0.06),
         *portal(*door_at, along_x, door, frame, 0.06, thick + 0.06),
         box((at + run, -d, near, d), "wall", LINTEL, TOP),
         box(out[0], "wall", LINTEL, TOP),
-        # The first door stands open, into the room.
-        leaf((near + 0.03, -d), math.radians(rng.uniform(-45, -5)), door, "leaf")
-        if rng.random() < 0.5
-        else leaf((near + 0.03, d), math.radians(rng.uniform(5, 45)), door, "leaf"),
+        first,
     ]
     # Doors that are shut, in walls with nothing behind them.
     x = rng.uniform(at + h + d + 0.3, far - d - 0.3)
@@ -132,8 +134,12 @@ def _room(draw: Draw, rng: np.random.Generator) -> Layout:
         hinge, angle = (back + thick + 0.03, door_at[1] + side * d), swing * (1 if h - d > 0.15 else 0)
     else:
         hinge, angle = (door_at[0] - d, high + thick + 0.03), math.pi / 2 + abs(swing)
+    # Nothing stands so near to the leaf of the first door that it walls in what is behind the leaf.
+    x, y, yaw, half = first.row[:4]
+    reach = half * np.array([math.cos(yaw), math.sin(yaw)])
+    kept = [inner, np.stack([(x, y) - reach, (x, y) + reach])]
     return Layout(
-        solids=solids + furniture((near, low, back, high), [inner], int(rng.integers(1, 5)), rng),
+        solids=solids + furniture((near, low, back, high), kept, int(rng.integers(1, 5)), rng),
         plugs=[_shut(*door_at, along_x, door, "leaf")],
         doorposts=[leaf(hinge, angle, min(door, width - 0.1), "leaf")],
         ways=[inner, np.array([*ways.detour, goal])],
