@@ -1,92 +1,130 @@
-"""Times of the two physics: steps per second of a batch of worlds, and native MuJoCo's on the same model."""
+"""The two physics next to native MuJoCo: steps per second among obstacles, in turn within one run."""
 
 import functools
-import statistics
-import time
+import os
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax.bench_sensors import random_obstacles
-from drnav_jax.sim import kinematic, mjx
+from drnav_jax.bench_sensors import interleaved
+from drnav_jax.sim import contact, kinematic, mjx
+from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.mjx import MjxParams, MjxSpec
 from drnav_jax.types import Command, RobotParams
+from drnav_jax.worlds.world import World, make_world, signed_distance, stack_worlds
 
-TICK = 0.1  # [s]
-
-
-def _commands(num_ticks: int, num_worlds: int) -> Command:
-    """Commands that change every second, `[T, B]`."""
-    draws = np.random.default_rng(0).uniform([0.2, -1.0], [1.0, 1.0], (-(-num_ticks // 10), num_worlds, 2))
-    held = np.repeat(draws, 10, axis=0)[:num_ticks].astype(np.float32)
-    return Command(v=jnp.asarray(held[..., 0]), omega=jnp.asarray(held[..., 1]))
+DT = 0.1  # [s] tick
+EXTENT = 9.0  # [m] half the edge of the square that the boxes fill
+ROOM = 0.1  # [m] between a robot's footprint and the boxes, where it starts
 
 
-def _native_rate(spec: MjxSpec, num_steps: int) -> float:
-    """Steps per second of `mj_step` on the same model, one robot on one thread, in contact with nothing."""
+def random_boxes(seed: int, count: int) -> tuple[World, np.ndarray]:
+    """A world of boxes at all angles, and a free pose `[3]` in it (host)."""
+    rng = np.random.default_rng(seed)
+    centre, yaw = rng.uniform(-EXTENT, EXTENT, (count, 2)), rng.uniform(-np.pi, np.pi, (count, 1))
+    world = make_world(np.concatenate([centre, yaw, rng.uniform(0.1, 0.7, (count, 2)), np.tile([0.0, 1.0], (count, 1))], 1))
+    while True:
+        places = rng.uniform(-EXTENT, EXTENT, (200, 2))
+        free = places[signed_distance(world, places) > float(RobotParams().radius) + ROOM]
+        if len(free):
+            return world, np.asarray([*free[0], rng.uniform(-np.pi, np.pi)], np.float32)
+
+
+def native(spec: MjxSpec, world: World) -> tuple[Any, Any, Any]:
+    """The module `mujoco`, a native model of this robot among all boxes of a world at once, and its data."""
     mujoco, _ = mjx.load()
-    model = mujoco.MjModel.from_xml_string(mjx.xml(spec))
-    data = mujoco.MjData(model)
-    begin = time.perf_counter()
-    mujoco.mj_step(model, data, nstep=num_steps)
-    return num_steps / (time.perf_counter() - begin)
+    boxes = np.asarray(world.boxes, float)
+    text = mjx.xml(MjxSpec(timestep=spec.timestep, near_boxes=len(boxes), iterations=spec.iterations))
+    scene = mujoco.MjSpec.from_string(text)
+    for geom, (x, y, yaw, half_x, half_y, _, _) in zip(scene.geoms, boxes, strict=False):
+        geom.pos, geom.size = [x, y, 0], [half_x, half_y, mjx.HALF_HEIGHT]
+        geom.quat = [np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]
+    servo = jax.device_get(mjx.servos(spec, MjxParams(), RobotParams(), FaultParams()))
+    body = scene.body("robot")
+    body.mass, body.inertia = float(servo["mass"]), [float(servo["inertia"])] * 3
+    for k, actuator in enumerate(scene.actuators):
+        actuator.gainprm[0], actuator.biasprm[2] = servo["setpoint_gain"][k], -servo["speed_gain"][k]
+        actuator.forcerange = [-servo["limit"][k], servo["limit"][k]]
+    model = scene.compile()
+    return mujoco, model, mujoco.MjData(model)
 
 
 def physics_rates(
-    num_worlds: int = 256, num_boxes: int = 100, num_ticks: int = 20, repeats: int = 5, spec: MjxSpec = MjxSpec()  # noqa: B008
+    batch: int = 256, num_boxes: int = 100, ticks: int = 20, repeats: int = 10, spec: MjxSpec = MjxSpec()  # noqa: B008
 ) -> dict[str, Any]:
-    """Steps per second of a batch, contacts on, in turn with the kinematic physics.
+    """Robots that drive at random among boxes and run into them, with contacts, in one batched call.
+
+    A step of MJX and of native MuJoCo is one time step; a step of kinematic physics, which has no shorter one, is a tick
+    with its distance to the obstacles. Native MuJoCo does one world on one thread.
 
     Args:
-        num_worlds: Robots, each in a world of its own.
-        num_boxes: Obstacles of a world, half of them boxes.
-        num_ticks: Ticks of 0.1 s in a call.
-        repeats: Calls that are timed.
-        spec: The model.
+        batch: Worlds, and robots.
+        num_boxes: Boxes in each.
+        ticks: Ticks per call.
+        repeats: How often each is timed.
+        spec: Sizes of the model.
 
     Returns:
-        `steps_per_s` of MJX (its own time steps), `kinematic_steps_per_s` (ticks), `ticks_per_s` of MJX,
-        `native_steps_per_s`, the share of robots that touched something, and the sizes.
+        `steps_per_s` of MJX, `ticks_per_s` of MJX, `kinematic_steps_per_s` and `native_steps_per_s` (medians), `ratio` (of
+        MJX to native MuJoCo), `touched` (share of the robots' ticks in contact, last call), `deepest_m` (inside a box, all
+        calls), `timestep_s`, `worlds`, `obstacles`, `matmul_ms` (1024^3 float32, in the same turns) and `load_average` (1
+        minute).
     """
-    worlds = [random_obstacles(seed, num_boxes, extent=8.0, gap=0.6) for seed in range(num_worlds)]
-    solids = jax.tree.map(jnp.asarray, mjx.solids_of(worlds, spec))
-    robot, commands = RobotParams(), _commands(num_ticks, num_worlds)
-    pose, body = jnp.zeros((num_worlds, 3), jnp.float32), mjx.init()
-    body = jax.tree.map(lambda a: jnp.broadcast_to(a, (num_worlds, *a.shape)), body)
-    twist = jnp.zeros((num_worlds, 2), jnp.float32)
+    every, starts = zip(*(random_boxes(seed, num_boxes) for seed in range(batch)), strict=True)
+    solids = jax.tree.map(jnp.asarray, mjx.solids_of(list(every), spec))
+    poses, bodies = jnp.asarray(np.stack(starts)), jax.vmap(lambda _: mjx.init())(jnp.arange(batch))
+    rng = np.random.default_rng(0)
+    speed, turn = (jnp.asarray(rng.uniform(*ends, batch), jnp.float32) for ends in ((0.3, 1.0), (-1.0, 1.0)))
+    commands, steps = Command(speed, turn), ticks * spec.steps_in(DT)
 
     @jax.jit
-    def with_mjx() -> tuple[Any, jax.Array]:
-        def tick(carry: Any, command: Command) -> tuple[Any, jax.Array]:
-            move = lambda s, p, b, c: mjx.step(spec, MjxParams(), robot, s, p, b, c, TICK)  # noqa: E731
-            p, _, b = jax.vmap(move)(solids, carry[0], carry[1], command)
-            return (p, b), b.contact
+    def drive(poses: Any, bodies: Any) -> tuple:
+        def tick(carry: tuple, _: None) -> tuple:
+            go = functools.partial(mjx.step, spec, MjxParams(), RobotParams(), dt=DT)
+            pose, _, body = jax.vmap(go)(solids, carry[0], carry[1], commands)
+            return (pose, body), (body.contact, body.depth)
 
-        return jax.lax.scan(tick, (pose, body), commands)
+        return jax.lax.scan(tick, (poses, bodies), None, length=ticks)
+
+    worlds = jax.tree.map(jnp.asarray, stack_worlds(list(every)))
 
     @jax.jit
-    def with_kinematic() -> Any:
-        def tick(carry: Any, command: Command) -> tuple[Any, None]:
-            move = lambda p, t, c: kinematic.step(robot, p, t, c, TICK)  # noqa: E731
-            return jax.vmap(move)(carry[0], carry[1], command), None
+    def slide(poses: Any, twists: Any) -> tuple:
+        def tick(carry: tuple, _: None) -> tuple:
+            go = lambda *a: kinematic.step(RobotParams(), *a, DT)  # noqa: E731
+            pose, twist = jax.vmap(go)(*carry, commands)
+            return (pose, twist), jax.vmap(contact.clearance)(worlds, pose[:, :2])
 
-        return jax.lax.scan(tick, (pose, twist), commands)[0]
+        return jax.lax.scan(tick, (poses, twists), None, length=ticks)
 
-    touched = float(np.mean(np.asarray(with_mjx()[1]).any(axis=0)))
-    jax.block_until_ready(with_kinematic())
-    calls: list[Any] = [with_mjx, with_kinematic, functools.partial(_native_rate, spec, 20_000)]
-    spent: list[list[float]] = [[], [], []]
-    for _ in range(repeats):
-        for call, times in zip(calls, spent, strict=True):
-            begin = time.perf_counter()
-            jax.block_until_ready(call())
-            times.append(time.perf_counter() - begin)
-    mjx_s, kinematic_s, native_s = (statistics.median(times) for times in spent)
-    ticks = num_worlds * num_ticks
+    state: dict[str, Any] = {"end": (poses, bodies), "deepest": 0.0}
+
+    def ours() -> Any:
+        state["end"], (state["touched"], depth) = drive(*state["end"])
+        state["deepest"] = max(state["deepest"], float(jnp.max(depth)))
+        return depth
+
+    mujoco, model, data = native(spec, every[0])
+    data.qpos[:], data.ctrl[:] = starts[0], (0.8, 0.0, 0.3)
+    square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
+    matmul = jax.jit(lambda a: a @ a)
+    calls: list[Callable[[], object]] = [
+        ours, lambda: slide(poses, jnp.zeros((batch, 2), jnp.float32)), lambda: mujoco.mj_step(model, data, nstep=steps),
+        lambda: matmul(square),
+    ]  # fmt: skip
+    seconds, kinematic_s, native_s, reference = interleaved(calls, repeats)
     return {
-        "steps_per_s": ticks * spec.steps_in(TICK) / mjx_s, "ticks_per_s": ticks / mjx_s,
-        "kinematic_steps_per_s": ticks / kinematic_s, "native_steps_per_s": 20_000 / native_s,
-        "touched": touched, "worlds": num_worlds, "obstacles": num_boxes, "timestep_s": spec.timestep,
+        "steps_per_s": batch * steps / seconds,
+        "ticks_per_s": batch * ticks / seconds,
+        "kinematic_steps_per_s": batch * ticks / kinematic_s,
+        "native_steps_per_s": steps / native_s,
+        "ratio": batch * native_s / seconds,
+        "touched": float(jnp.mean(state["touched"])),
+        "deepest_m": state["deepest"],
+        "timestep_s": spec.timestep, "worlds": batch, "obstacles": num_boxes,
+        "matmul_ms": 1e3 * reference,
+        "load_average": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
     }  # fmt: skip

@@ -220,9 +220,10 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
     batch = len(trips)
     spread = lambda tree: _stack([tree] * batch)  # noqa: E731
     physics = with_physics(EpisodeSpec(), setup).physics
-    solids = () if physics is None else mjx.solids_of([t.scene.world for t in trips], physics)
+    every = [t.scene.world for t in trips]
+    solids = () if physics is None else mjx.solids_of(every, physics)
     return EpisodeParams(
-        world=worlds.stack_worlds([t.scene.world for t in trips]),
+        world=worlds.stack_worlds(every),
         start=_float32([t.scene.start for t in trips]),
         goal=_float32([t.scene.goal for t in trips]),
         time_limit=_float32([t.time_limit for t in trips]),

@@ -24,6 +24,7 @@ def test_every_figure_is_there(result):
     assert set(result["planning"]) == {"plan", "cost_to_go", "scaling", "threads"}
     assert {"rays_per_s", "mujoco_rays_per_s", "ratio", "max_error_m"} <= set(result["lidar"])
     assert set(result["camera"]) == {"images_per_s", "mujoco_images_per_s", "ratio", "no_mujoco", "matmul_ms"}
+    assert {"steps_per_s", "kinematic_steps_per_s", "native_steps_per_s", "ratio", "matmul_ms"} <= set(result["mjx"])
     assert {"cores", "cpu", "jax", "platform", "python"} <= set(result["machine"])
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
@@ -42,6 +43,9 @@ def test_figures_fit_together(result):
         assert camera["ratio"] == pytest.approx(camera["images_per_s"] / camera["mujoco_images_per_s"])
     else:
         assert "libegl1" in camera["no_mujoco"] and camera["ratio"] is camera["mujoco_images_per_s"] is None
+    physics = result["mjx"]
+    assert physics["ratio"] == pytest.approx(physics["steps_per_s"] / physics["native_steps_per_s"])
+    assert min(physics["kinematic_steps_per_s"], physics["matmul_ms"]) > 0 and physics["deepest_m"] < 0.02
     assert lidar["max_error_m"] < 1e-3 and lidar["mismatches"] == 0
 
 
@@ -81,6 +85,7 @@ def test_difference_is_that_of_the_scores():
 
 def test_table_names_every_part(result):
     text = bench.table(result)
-    for part in ("tick, 4,096", "tick that replans", "65,536 x 56", "LiDAR", "camera 96x96", "episodes", "matmul"):
+    parts = ("tick, 4,096", "tick that replans", "65,536 x 56", "LiDAR", "camera 96x96", "MJX, 8 worlds of 20", "episodes")
+    for part in (*parts, "matmul"):
         assert part in text
     assert result["machine"]["cpu"] in text

@@ -59,6 +59,8 @@ def shell(*argv, **kwargs):
         ("run --world u:0 --max-speed nan", "max_speed"),
         ("run --world u:0 --risk-weight -1", "risk_weight"),
         ("run --world u:0 --time-limit 0", "time_limit"),
+        ("run --world u:0 --physics bullet", "--physics"),
+        ("run --world u:0 --physics mjx --mjx-boxes 2", "raise num_boxes (--mjx-boxes on the command line)"),
         ("run --world u:0 --start 1,2", "--start must be X,Y,YAW"),
         ("run --world u:0 --start 900,2,0", "the start (900.00, 2.00) is off the map"),
         ("run --world u:0 --goal -11.9,1.0", "the goal (-11.90, 1.00) is"),
@@ -235,3 +237,16 @@ def test_bench_prints_what_it_measures(capsys, monkeypatch):
     assert code == 0 and json.loads(out) == {"episodes_per_s": 2.5, "machine": {"quick": True}}
     code, out, _ = call(capsys, "bench")
     assert out.splitlines() == ["episodes_per_s: 2.5", "machine", "  quick: False"]
+
+
+@pytest.mark.slow
+def test_both_physics_agree_in_open_space(capsys):
+    records = {}
+    for physics in ("kinematic", "mjx"):
+        code, out, _ = call(
+            capsys, "run", "--world", "open:1", "--physics", physics, "--no-pictures", "--json", "--out", physics
+        )
+        records[physics] = json.loads(out)["episodes"][0]  # and nothing else is on stdout
+        assert code == 0 and records[physics]["success"]
+    for what in ("time_s", "distance_m"):
+        assert records["mjx"][what] == pytest.approx(records["kinematic"][what], rel=0.02)

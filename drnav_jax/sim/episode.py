@@ -91,7 +91,7 @@ class EpisodeParams(NamedTuple):
     lidar: LidarParams = LidarParams()
     faults: FaultParams = FaultParams()
     motors: Any = ()  # `mjx.MjxParams` if the physics is MJX
-    solids: Any = ()  # `mjx.Solids` of the world if the physics is MJX
+    solids: Any = ()  # `solids.Solids` of the world if the physics is MJX
 
 
 class EpisodeState(NamedTuple):

@@ -30,20 +30,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from drnav_jax.geometry import wrap_angle
 from drnav_jax.sim.kinematic import FaultParams
+from drnav_jax.sim.solids import BEYOND, Solids, collect, nearest
 from drnav_jax.types import Command, RobotParams, Scalar
-from drnav_jax.worlds.materials import BLOCKS
-from drnav_jax.worlds.rectangles import wall_boxes
-from drnav_jax.worlds.world import FAR, World
+from drnav_jax.worlds.world import World
 
 GRAVITY = 9.81  # [m/s^2]
 MAX_SPEED = 20.0  # [m/s] and [rad/s]; only a robot that begins deep inside an obstacle is ever thrown out so fast
-PAD = 32  # arrays of solids grow in steps of this many rows, so that similar batches share a program
-BEYOND = 100.0  # [m] from the robot: where obstacles of the model lie that are not needed
 HALF_HEIGHT = 10.0  # [m] of the model's boxes: no contact is ever with their tops
 
 _IMPORT = threading.Lock()
@@ -105,13 +101,6 @@ class MjxParams(NamedTuple):
     grip: Scalar = 0.8  # [] coefficient of friction of the tyres on the ground
 
 
-class Solids(NamedTuple):
-    """What stops a robot in one world, seen from above; rows that fill up lie at `FAR`."""
-
-    boxes: Float[Array, "Nb 5"]  # centre x, y, yaw, half lengths along and across yaw [m, rad]
-    posts: Float[Array, "Np 3"]  # centre x, y, radius [m]
-
-
 class Body(NamedTuple):
     """What the physics carries besides the pose."""
 
@@ -133,48 +122,13 @@ def uniform(key: PRNGKeyArray, low: Any, high: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(low), drawn)
 
 
-def _rows(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes `[N, 5]` and posts `[N, 3]` of one world that stop a robot; a grid's walls are among the boxes."""
-    boxes = np.asarray(world.boxes, np.float64)[BLOCKS[np.asarray(world.box_surfaces.material)]]
-    posts = np.asarray(world.cylinders, np.float64)[BLOCKS[np.asarray(world.cylinder_surfaces.material)]]
-    boxes, posts = boxes[boxes[:, 0] < FAR / 2, :5], posts[posts[:, 0] < FAR / 2, :3]
-    return np.concatenate([boxes, wall_boxes(world)]), posts
-
-
 def solids_of(worlds: list[World], spec: MjxSpec = MjxSpec()) -> Solids:  # noqa: B008 (immutable)
-    """What stops a robot in each world of a batch (host).
-
-    Args:
-        worlds: One world each. Only materials that block count, drops included, whatever their height.
-        spec: How many there may be.
-
-    Returns:
-        Solids `[B, ...]`, NumPy float32, padded to a common number of rows.
+    """What stops a robot in each world of a batch, NumPy `[B, ...]`; see `solids.collect`.
 
     Raises:
         ValueError: If a world has more boxes or cylinders than the model takes; says how many and what to do.
     """
-    known = {id(world): _rows(world) for world in worlds}  # trips on one map share their world
-    every = [known[id(world)] for world in worlds]
-    limits = ((0, "boxes (a map's walls are merged into rectangles)", "num_boxes"), (1, "cylinders", "num_posts"))
-    for which, what, limit in limits:
-        most, held = max((len(rows[which]) for rows in every), default=0), getattr(spec, limit)
-        if most > held:
-            flag = " (--mjx-boxes on the command line)" if limit == "num_boxes" else ""
-            raise ValueError(
-                f"the world has {most} {what}, and the MJX model takes {held}: "
-                f"raise {limit}{flag}, or use kinematic physics (--physics kinematic)."
-            )
-
-    def padded(which: int, empty: tuple[float, ...]) -> Any:
-        count = max(len(rows[which]) for rows in every)
-        count = max(-(-count // PAD) * PAD, PAD)
-        out = np.tile(np.asarray(empty, np.float32), (len(every), count, 1))
-        for k, rows in enumerate(every):
-            out[k, : len(rows[which])] = rows[which]
-        return out
-
-    return Solids(boxes=padded(0, (FAR, FAR, 0.0, 1.0, 1.0)), posts=padded(1, (FAR, FAR, 1.0)))
+    return collect(worlds, spec.num_boxes, spec.num_posts)
 
 
 def load() -> tuple[Any, Any]:
@@ -253,35 +207,8 @@ def servos(spec: MjxSpec, params: MjxParams, robot: RobotParams, faults: FaultPa
     }
 
 
-def nearest(spec: MjxSpec, solids: Solids, xy: Float[Array, "2"]) -> Solids:
-    """The `near_boxes` boxes and `near_posts` posts that a point is closest to, relative to that point."""
-
-    def closest(rows: Array, distance: Array, count: int) -> Array:
-        if rows.shape[0] < count:
-            far = jnp.asarray([BEYOND, BEYOND, *[1.0] * (rows.shape[1] - 2)], jnp.float32)
-            return jnp.concatenate([rows, jnp.tile(far[None], (count - rows.shape[0], 1))])
-        return rows[jax.lax.top_k(-distance, count)[1]]
-
-    shift = xy[None]
-    boxes = jnp.concatenate([solids.boxes[:, :2] - shift, solids.boxes[:, 2:]], axis=1)
-    posts = jnp.concatenate([solids.posts[:, :2] - shift, solids.posts[:, 2:]], axis=1)
-    x, y, yaw, half_x, half_y = boxes.T
-    c, s = jnp.cos(yaw), jnp.sin(yaw)
-    out_x, out_y = jnp.abs(c * x + s * y) - half_x, jnp.abs(c * y - s * x) - half_y
-    # Squared, and below zero inside: which one is closest is all that matters.
-    beyond = jnp.maximum(out_x, 0.0) ** 2 + jnp.maximum(out_y, 0.0) ** 2 + jnp.minimum(jnp.maximum(out_x, out_y), 0.0)
-    boxes = closest(boxes, beyond, spec.near_boxes)
-    posts = closest(posts, jnp.hypot(posts[:, 0], posts[:, 1]) - posts[:, 2], spec.near_posts)
-
-    def moved(rows: Array) -> Array:  # padding comes within reach of float32
-        padding = jnp.abs(rows[:, :1]) > FAR / 2
-        return jnp.where(padding, jnp.concatenate([jnp.full_like(rows[:, :2], BEYOND), rows[:, 2:]], axis=1), rows)
-
-    return Solids(boxes=moved(boxes), posts=moved(posts))
-
-
 def fitted(spec: MjxSpec, params: MjxParams, robot: RobotParams, faults: FaultParams, near: Solids) -> Any:
-    """The MJX model with this robot and these obstacles (`nearest`)."""
+    """The MJX model with this robot and these obstacles (`solids.nearest`)."""
     made, _ = model(spec)
     servo = servos(spec, params, robot, faults)
     nb, np_ = near.boxes.shape[0], near.posts.shape[0]
@@ -356,7 +283,7 @@ def step(
     _, mjx = load()
     _, empty = model(spec)
     steps, h = spec.steps_in(dt), spec.timestep
-    fit = fitted(spec, params, robot, faults, nearest(spec, solids, pose[:2]))
+    fit = fitted(spec, params, robot, faults, nearest(solids, pose[:2], spec.near_boxes, spec.near_posts))
     v, omega = (jnp.where(jnp.isnan(u), 0.0, u) for u in (command.v, command.omega))
     target = jnp.stack([
         jnp.clip(v, robot.v_min, robot.v_max), jnp.clip(omega, -robot.w_max, robot.w_max)

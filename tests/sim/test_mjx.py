@@ -17,6 +17,7 @@ from drnav_jax.sim import episode, mjx
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
 from drnav_jax.sim.mjx import MjxParams, MjxSpec
+from drnav_jax.sim.solids import Solids
 from drnav_jax.types import Command, RobotParams
 from drnav_jax.worlds import Material, make_world, signed_distance, surfaces
 
@@ -30,20 +31,20 @@ ROWS = 64  # of all solids here, so that they share a program
 ENTERED = 0.02  # [m] deepest that a robot at 1 m/s may be inside an obstacle
 
 
-def solids_of(*each, spec=SPEC):
+def rows_of(*each):
     """Solids `[B, ...]` of worlds, padded to `ROWS`."""
-    solids = mjx.solids_of(list(each), spec)
+    given = mjx.solids_of(list(each))
 
     def padded(rows):
         more = np.tile(rows[:1, :1], (len(rows), ROWS - rows.shape[1], 1))
         more[..., :2] = worlds.FAR
         return jnp.asarray(np.concatenate([rows, more], axis=1))
 
-    return mjx.Solids(*map(padded, solids))
+    return Solids(*map(padded, given))
 
 
 def single(world):
-    return jax.tree.map(lambda a: a[0], solids_of(world))
+    return jax.tree.map(lambda a: a[0], rows_of(world))
 
 
 EMPTY = make_world()
@@ -196,10 +197,10 @@ def test_contact_is_where_native_mujoco_has_it(world, start):
     poses, _, bodies = drive(single(world), commands, start)
     expected, native_deepest = drive_native(world, commands, start)
     assert any(b.contact for b in bodies)
-    assert apart(poses, expected) < 0.01
+    assert apart(poses, expected) < 1e-3
     deepest = max(float(b.depth) for b in bodies)
     assert deepest < ENTERED and native_deepest < ENTERED
-    assert abs(deepest - native_deepest) < 0.003
+    assert abs(deepest - native_deepest) < 1e-3
     assert (signed_distance(world, poses[:, :2]) - RADIUS).min() > -ENTERED
 
 
@@ -223,7 +224,7 @@ def crowd():
         xy = places[signed_distance(world, places) > RADIUS + 0.05][0]
         every.append(world)
         poses.append([*xy, rng.uniform(-np.pi, np.pi)])
-    return every, solids_of(*every), jnp.asarray(poses, jnp.float32), jax.vmap(lambda _: mjx.init())(jnp.arange(256))
+    return every, rows_of(*every), jnp.asarray(poses, jnp.float32), jax.vmap(lambda _: mjx.init())(jnp.arange(256))
 
 
 TICKS = 100
@@ -346,32 +347,6 @@ def test_what_is_near_counts_even_among_many_long_walls():
     assert poses[-1, 0] == pytest.approx(1.9 - RADIUS, abs=1e-3)
 
 
-def test_the_nearest_are_those_with_the_least_distance():
-    world = jax.tree.map(np.asarray, random_obstacles(3, 60, extent=6.0))
-    solids = single(world)
-    rng = np.random.default_rng(0)
-    find = jax.jit(functools.partial(mjx.nearest, SPEC))
-    for xy in rng.uniform(-6, 6, (20, 2)):
-        near = find(solids, jnp.asarray(xy, jnp.float32))
-        each = [signed_distance(make_world(boxes=[b]), xy)[0] for b in world.boxes]
-        chosen = [signed_distance(make_world(boxes=[[*b, 0, 1]]), np.zeros(2))[0] for b in np.asarray(near.boxes)]
-        np.testing.assert_allclose(np.sort(chosen), np.sort(each)[:8], atol=1e-4)
-        each = [signed_distance(make_world(cylinders=[c]), xy)[0] for c in world.cylinders]
-        chosen = [signed_distance(make_world(cylinders=[[*c, 0, 1]]), np.zeros(2))[0] for c in np.asarray(near.posts)]
-        np.testing.assert_allclose(np.sort(chosen), np.sort(each)[:4], atol=1e-4)
-
-
-def test_a_world_that_is_too_large_is_refused():
-    occupied = np.indices((20, 20)).sum(0) % 2 == 0
-    grid = worlds.from_grid(occupied, (0.0, 0.0), 0.1)
-    assert mjx.solids_of([grid], MjxSpec(num_boxes=200)).boxes.shape == (1, 224, 5)
-    with pytest.raises(ValueError, match=r"has 200 boxes .* takes 199: raise num_boxes \(--mjx-boxes .*kinematic"):
-        mjx.solids_of([EMPTY, grid], MjxSpec(num_boxes=199))
-    posts = make_world(cylinders=[[k, 0, 0.1, 0, 1] for k in range(5)])
-    with pytest.raises(ValueError, match="has 5 cylinders, and the MJX model takes 4: raise num_posts, or"):
-        mjx.solids_of([posts], MjxSpec(num_posts=4))
-
-
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -402,7 +377,7 @@ def test_uniform_draws_between_its_ends():
 
 def test_vmap_is_a_loop_and_a_sweep_compiles_once():
     world = jax.tree.map(np.asarray, random_obstacles(5, 60, extent=5.0))
-    solids = solids_of(world, WALL, EMPTY)
+    solids = rows_of(world, WALL, EMPTY)
     poses = jnp.asarray([[0, 0, 0.3], [1.5, 0, 0], [3, 1, -2]], jnp.float32)
     command = Command(jnp.float32(0.8), jnp.float32(0.4))
     bodies = jax.vmap(lambda _: mjx.init())(jnp.arange(3))
@@ -498,7 +473,7 @@ def _bare():
 
 @pytest.mark.parametrize("physics", [None, SPEC])
 def test_a_late_command_is_the_same_command_later(physics):
-    rows = [(EMPTY, (0, 0, 0), (4.0, 0.0), 60.0)]
+    rows = [(EMPTY, (0, 0, 0), (4.0, 0.0), 60.0), *ROWS_DRIVEN[1:]]  # straight ahead, so that nothing is steered late
     prompt, late = pursue(physics, rows), pursue(physics, rows, FaultParams(delay=0.3))
     assert late.state.tick[0] == prompt.state.tick[0] + 3
     n = int(prompt.state.tick[0])
