@@ -71,6 +71,20 @@ def test_slip_moves_the_robot_less_than_its_wheels():
     np.testing.assert_allclose(twist, [1.0, 1.0])
 
 
+@pytest.mark.parametrize(
+    ("delay", "ticks"), [(0.0, 0), (0.04, 0), (0.06, 1), (0.3, 3), (0.4, 4), (0.7, 4), (-1.0, 0)]
+)
+def test_commands_come_as_late_as_they_shall(delay, ticks):
+    given = np.random.default_rng(0).uniform(-1, 1, (12, 2)).astype(np.float32)
+    pending, through = jnp.zeros((4, 2)), []
+    for v, omega in given:
+        command = Command(jnp.asarray(v), jnp.asarray(omega))
+        pending, late = sim.delayed(pending, command, DT, sim.FaultParams(delay=delay))
+        through.append([float(late.v), float(late.omega)])
+    expected = np.concatenate([np.zeros((ticks, 2)), given])[:12]  # before the first one, it stands
+    np.testing.assert_array_equal(through, expected.astype(np.float32))
+
+
 def test_odometry_without_faults_is_the_truth_and_drifts_with_them():
     rng = np.random.default_rng(0)
     pose, twist = jnp.asarray([3.0, 1.0, 3.0]), jnp.zeros(2)
