@@ -56,7 +56,9 @@ class MjxSpec:
         near_boxes: Boxes that the model holds: those nearest to the robot at the beginning of a tick.
         near_posts: Cylinders that it holds.
         max_contacts: Contacts that are solved: the deepest.
-        iterations: Newton iterations of the contact solver; with one, robots slide around corners too fast.
+        iterations: Newton iterations of the contact solver, which starts from the motion without contacts (from rest,
+            MuJoCo's warm start here, one iteration ends anywhere). One is exact for one contact; among several at a
+            time, paths stay within 5 cm in 5 s of those with many, and two or three are as good as many.
         ls_iterations: Iterations of its line search.
     """
 
@@ -66,7 +68,7 @@ class MjxSpec:
     near_boxes: int = 8
     near_posts: int = 4
     max_contacts: int = 4
-    iterations: int = 2
+    iterations: int = 1
     ls_iterations: int = 4
 
     def __post_init__(self) -> None:
@@ -147,7 +149,7 @@ def xml(spec: MjxSpec) -> str:
 <mujoco>
   <option timestep="{spec.timestep}" gravity="0 0 0" integrator="Euler" solver="Newton" cone="pyramidal"
           iterations="{spec.iterations}" ls_iterations="{spec.ls_iterations}">
-    <flag eulerdamp="disable"/>
+    <flag eulerdamp="disable" warmstart="disable"/>
   </option>
   <default><geom solref="{2 * spec.timestep} 1" solimp="0.9 0.95 0.001"/></default>
   <custom><numeric name="max_contact_points" data="{spec.max_contacts}"/></custom>

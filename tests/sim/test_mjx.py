@@ -204,6 +204,18 @@ def test_contact_is_where_native_mujoco_has_it(world, start):
     assert (signed_distance(world, poses[:, :2]) - RADIUS).min() > -ENTERED
 
 
+def test_among_many_obstacles_it_stays_close_to_native_mujoco():
+    off, touched = [], 0
+    for seed in range(10):
+        world = jax.tree.map(np.asarray, random_obstacles(seed, 60, extent=4.0, gap=0.4))
+        commands = random_commands(seed)
+        poses, _, bodies = drive(single(world), commands)
+        off.append(apart(poses, drive_native(world, commands)[0]))
+        touched += any(b.contact for b in bodies)
+    assert touched >= 8
+    assert np.median(off) < 1e-3 and max(off) < 0.05, "one solver iteration instead of 100"
+
+
 def test_a_wall_stops_it():
     poses, twists, bodies = drive(single(WALL), [(1.0, 0.0)] * 40)
     np.testing.assert_allclose(poses[-1], [FACE - RADIUS, 0, 0], atol=1e-3)
