@@ -3,9 +3,9 @@
 All of it is drawn from generators of their own, one for the place and one for each role, so that neither the geometry
 nor the other twin's solids change what a seed looks like:
 
-    colour = clip(one of the material's colours * (1 + gain) + tint / 2, 0.03, 0.95),   gain, tint ~ U(-s, s)    (1)
+    colour = clip(one of the material's colours * (1 + gain + tint), 0.03, 0.95),   gain, tint ~ U(-s, s)    (1)
 
-with the spread s of the split. Nothing here depends on whether a way is open.
+with the spread s of the split and a tint for each channel. Nothing here depends on whether a way is open.
 """
 
 import math
@@ -29,12 +29,12 @@ LIGHT: dict[str, tuple[Range, Range]] = {
     "exposure": ((0.85, 1.1), (0.7, 1.25)),
     "spread": ((0.0, 0.1), (0.0, 0.2)),  # s of eq. 1
 }
-INDOOR = 0.2  # by which the ambient share is higher under a ceiling
+INDOOR = 0.1  # by which the ambient share is higher under a ceiling
 
 ROLES: dict[str, tuple[M, ...]] = {
     "lift": (M.METAL,),
     "frame": (M.METAL, M.WOOD),
-    "leaf": (M.WOOD, M.METAL),
+    "leaf": (M.WOOD, M.WOOD, M.METAL),
     "pane": (M.GLASS,),
     "hedge": (M.BUSH,),
     "bush": (M.BUSH,),
@@ -125,7 +125,7 @@ def _colour(material: M, spread: float, rng: np.random.Generator) -> np.ndarray:
     """Equation 1."""
     base = np.array(COLOURS[material][rng.integers(len(COLOURS[material]))])
     gain, tint = rng.uniform(-spread, spread), rng.uniform(-spread, spread, 3)
-    return np.clip(base * (1 + gain) + tint / 2, 0.03, 0.95)
+    return np.clip(base * (1 + gain + tint), 0.03, 0.95)
 
 
 def _generator(key: Sequence[int], role: str) -> np.random.Generator:

@@ -129,12 +129,14 @@ def _room(draw: Draw, rng: np.random.Generator) -> Layout:
     inner = np.array([*ways.stem, *line, goal])
     # The second door opens away from the room, along a wall of what is behind it.
     side = rng.choice([-1.0, 1.0])
-    swing = math.radians(rng.uniform(0, 12)) * side
+    # Its tip stays off that wall, or what is behind it would be walled in.
+    room = math.asin(max(h - d - 0.2, 0.0) / door)
+    swing = min(math.radians(rng.uniform(0, 12)), room)
     if along_x:
-        hinge, angle = (back + thick + 0.03, door_at[1] + side * d), swing * (1 if h - d > 0.15 else 0)
+        hinge, angle = (back + thick + 0.03, door_at[1] + side * d), side * swing
     else:
-        hinge, angle = (door_at[0] - d, high + thick + 0.03), math.pi / 2 + abs(swing)
-    # Nothing stands so near to the leaf of the first door that it walls in what is behind the leaf.
+        hinge, angle = (door_at[0] - d, high + thick + 0.03), math.pi / 2 + swing
+    # Furniture stays off the leaf of the first door, too.
     x, y, yaw, half = first.row[:4]
     reach = half * np.array([math.cos(yaw), math.sin(yaw)])
     kept = [inner, np.stack([(x, y) - reach, (x, y) + reach])]

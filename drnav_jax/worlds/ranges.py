@@ -76,7 +76,7 @@ RANGES: dict[str, dict[str, tuple[Range | None, Range]]] = {
         "width": ((1.8, 2.6), (1.7, 3)),  # of the corridors
         "depth": ((4.5, 6.5), (4, 8)),  # of the room
         "hall": ((4.5, 6.5), (4, 8)),  # width of the room
-        "door": ((1.3, 1.5), (1.25, 1.6)),
+        "door": ((1.3, 1.42), (1.25, 1.48)),
         "end": ((2.5, 4), (2.2, 5)),  # room to the far side of the block
         "aside": ((5, 7), (4.5, 8)),  # stem to the way round
         "behind": ((3, 5), (2, 6)),  # block to goal
