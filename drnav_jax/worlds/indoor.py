@@ -110,7 +110,9 @@ def _room(draw: Draw, rng: np.random.Generator) -> Layout:
     # The first door stands open, into the room, to either side.
     side = -1 if rng.random() < 0.5 else 1
     lean = rng.uniform(-45, -5) if side < 0 else rng.uniform(5, 45)
-    first = leaf((near + 0.03, side * d), math.radians(lean), door, "leaf")
+    # The tips of leaves stay off the walls beside them, or what is behind them would be walled in.
+    room = math.asin(min(max((high if side > 0 else -low) - d - 0.2, 0.0) / door, 1.0))
+    first = leaf((near + 0.03, side * d), side * min(math.radians(abs(lean)), room), door, "leaf")
     solids = [
         *blocked,
         *portal(near - thick / 2, 0.0, True, door, frame, 0.06, thick + 0.06),
@@ -125,11 +127,12 @@ def _room(draw: Draw, rng: np.random.Generator) -> Layout:
     if hall - door > 1.5 and rng.random() < 0.6:
         x = rng.uniform(near + d + 0.3, back - d - 0.3)
         solids += [_shut(x, low, False, door, "leaf"), *portal(x, low, False, door, frame, 0.06, 0.1)]
-    start, goal = (0.0, rng.uniform(-0.2, 0.2)), (far + behind, rng.uniform(0.0, 1.0) * max(line[-1][1], 1.0))
+    # Where the way round leaves the stem by less than the way through, the goal lies on the other side.
+    start, goal_y = (0.0, rng.uniform(-0.2, 0.2)), rng.uniform(0.0, 1.0) * max(line[-1][1], 1.0)
+    goal = (far + behind, max(goal_y, line[-1][1] - aside + 1.0))
     inner = np.array([*ways.stem, *line, goal])
     # The second door opens away from the room, along a wall of what is behind it.
     side = rng.choice([-1.0, 1.0])
-    # Its tip stays off that wall, or what is behind it would be walled in.
     room = math.asin(max(h - d - 0.2, 0.0) / door)
     swing = min(math.radians(rng.uniform(0, 12)), room)
     if along_x:
