@@ -115,7 +115,7 @@ SETTINGS: dict[str, Setting] = {
     ),
     "trail": Setting(walls=(M.WOOD, M.BRICK), grounds=(M.GRAVEL, M.LAWN, M.LAWN)),
     "field": Setting(),
-    "maze": _LOW,
+    "maze": Setting(),  # some are of hedges
     "office": Setting(indoor=1.0, floors=(M.CARPET, M.CARPET, M.TILES, M.CONCRETE)),
     "site": Setting(),
 }

@@ -15,12 +15,13 @@
 | `cars` | an aisle between parked cars that ends at a row of them; in the open twin one is missing |
 | `trail` | a trail that bushes cross; in the open twin it is tall grass, which is no obstacle |
 | `field` | clutter that stands in pockets, one of them on the way |
-| `maze` | a maze; the open twin lacks a wall at the end of a dead end |
-| `office` | an office floor: two corridors, rooms; the corridor toward the goal ends |
-| `site` | four to six of the above, one behind the other in two lanes (`compounds`) |
+| `maze` | a maze of walls or hedges |
+| `office` | an office floor: corridors and cross corridors, some shut halfway, rooms with a door or two |
+| `site` | a compound of houses and yards, 30-80 m across, in which all of the above occur |
 
 Each but `open` has an open twin (`u-open` ...): same seed, same everything, but the dead end has a
-way through, which then is the shortest way. All but `open`, `u` and `field` are ways through a solid
+way through, which then is the shortest way; of the last three families, that hold many decisions, some of the dead
+ends have one. All but `open`, `u` and `field` are ways through a solid
 block in a wall that runs on for `WING` metres to either side: nobody gets around it, yet all that is
 free touches the edge of the ground truth. The robot starts inside a stem, in `corridor` beside a
 fence, so that turning back never looks like a short way either.
@@ -45,7 +46,7 @@ import numpy as np
 
 from drnav_jax.worlds import indoor, layouts, outdoor
 from drnav_jax.worlds.clutter import clutter
-from drnav_jax.worlds.compounds import site_of
+from drnav_jax.worlds.compounds import site
 from drnav_jax.worlds.dressing import SETTINGS, Look
 from drnav_jax.worlds.mazes import maze
 from drnav_jax.worlds.offices import office
@@ -56,9 +57,8 @@ from drnav_jax.worlds.world import Scene, rasterise
 RESOLUTION = 0.1  # [m] of the ground truth
 MARGIN = 3.0  # [m] of ground truth around everything but the wings
 SPLITS = ("train", "val", "test")
-_SINGLE = {**layouts.LAYOUTS, **indoor.LAYOUTS, **outdoor.LAYOUTS}
-_MODULES = {name: of for name, of in _SINGLE.items() if name not in ("open", "field")}
-LAYOUTS = {**_SINGLE, "maze": maze, "office": office, "site": site_of(_MODULES)}
+MANY = {"maze": maze, "office": office, "site": site}  # families of many decisions
+LAYOUTS = {**layouts.LAYOUTS, **indoor.LAYOUTS, **outdoor.LAYOUTS, **MANY}
 
 # Name of each family -> name of the one whose dead ends are closed.
 FAMILIES: dict[str, str] = {name: name for name in LAYOUTS} | {

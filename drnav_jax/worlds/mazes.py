@@ -1,126 +1,185 @@
-"""A maze: corridors of one width on a grid of cells, a tree of them, so that there is one way through.
+"""Mazes: a grid of cells between walls, one way through, some loops, and dead ends of all sizes.
 
-The tree grows from its newest cell, and now and then from any: a depth-first walk alone makes no two branches that
-neighbour each other, and the twin needs that. The open twin lacks one wall: that at the end of a dead end, behind which the
-way goes on and which then is on the shortest way.
+The maze is a spanning tree of the grid with a few more walls taken out (`networks`). Its open twin has some of the dead
+ends opened, at least one of which makes the way through shorter by `SAVING` cells or more. A maze is drawn again until
+the trip meets `decisions` side branches that lead nowhere and one of them can be such a shortcut.
+
+Walls are walls, or hedges: then plants and grass close and cross the passages. Elsewhere it is panes and frames, doors,
+crates, drops and paint. All of these also stand where both twins are open, or both closed.
 """
 
+from typing import NamedTuple
 
 import numpy as np
 
-from drnav_jax.worlds.solids import Draw, Layout, Solid, wall, wings
+from drnav_jax.worlds import networks
+from drnav_jax.worlds.closures import close, fits
+from drnav_jax.worlds.covering import cover
+from drnav_jax.worlds.networks import Edge
+from drnav_jax.worlds.solids import WAY, Draw, Layout, Point, Rect, Solid, box, post
 
-BRANCH = 2  # cells; the dead end that the twin opens is at least this long
-NEWEST = 0.7  # share of cells that are grown from the newest one
-Cell = tuple[int, int]  # column, row
-
-
-def _grown(nx: int, ny: int, first: Cell, rng: np.random.Generator) -> dict[Cell, Cell | None]:
-    """The cell that each cell was reached from, from the first on."""
-    parent: dict[Cell, Cell | None] = {first: None}
-    growing = [first]
-    while growing:
-        k = -1 if rng.random() < NEWEST else int(rng.integers(len(growing)))
-        i, j = growing[k]
-        near = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
-        new = [c for c in near if 0 <= c[0] < nx and 0 <= c[1] < ny and c not in parent]
-        if not new:
-            growing.pop(k)
-            continue
-        cell = new[rng.integers(len(new))]
-        parent[cell] = (i, j)
-        growing.append(cell)
-    return parent
+WING = 100.0  # [m] of wall to either side: nobody walks around a maze
+SAVING = 4.0  # [cells] by which a shortcut is shorter
+TRIES = 300  # mazes drawn until one is as it should
+HEDGES = 0.3  # share of the mazes whose walls are hedges
+HEDGE_KINDS = ("hedge", "hedge", "crates", "drop")
+WALL_KINDS = ("glass", "door", "crates", "drop", "wall", "glass")
 
 
-def _back(parent: dict[Cell, Cell | None], cell: Cell) -> list[Cell]:
-    """Cells from one to the root."""
-    way: list[Cell] = []
-    at: Cell | None = cell
-    while at is not None:
-        way.append(at)
-        at = parent[at]
-    return way
+class _Grid(NamedTuple):
+    """Cells of a maze: cell (i, j) is node i + columns j."""
 
+    columns: int
+    rows: int
+    pitch: float
+    thickness: float
 
-def _shortcut(parent: dict[Cell, Cell | None], last: Cell) -> tuple[Cell, Cell] | None:
-    """The wall between the end of a branch and what lies behind it that shortens the way to `last` most, if any does."""
-    way = _back(parent, last)
-    on_way = {cell: k for k, cell in enumerate(way)}  # steps to `last`
-    steps = {cell: len(_back(parent, cell)) - 1 for cell in parent}
+    @property
+    def edges(self) -> list[Edge]:
+        return networks.grid_edges(self.columns, self.rows)
 
-    def to_last(cell: Cell) -> int:
-        back = _back(parent, cell)
-        k = next(k for k, c in enumerate(back) if c in on_way)
-        return k + on_way[back[k]]
+    def centre(self, node: int) -> Point:
+        j, i = divmod(node, self.columns)
+        return ((i + 0.5) * self.pitch, (j + 0.5) * self.pitch)
 
-    best, gain = None, 1
-    for a in parent:
-        branch = next(k for k, c in enumerate(_back(parent, a)) if c in on_way)
-        if branch < BRANCH:
-            continue
-        i, j = a
-        for b in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-            if b in parent and parent[a] != b and parent[b] != a:
-                saved = len(way) - 1 - (steps[a] + 1 + to_last(b))
-                if saved > gain:
-                    best, gain = (a, b), saved
-    return best
+    def gap(self, edge: Edge) -> tuple[Point, Point]:
+        """Jambs of the passage between two cells, between the posts of the grid."""
+        (ax, ay), (bx, by) = self.centre(edge[0]), self.centre(edge[1])
+        x, y, h = (ax + bx) / 2, (ay + by) / 2, (self.pitch - self.thickness) / 2
+        return ((x, y - h), (x, y + h)) if ay == by else ((x - h, y), (x + h, y))
 
-
-def _runs(edges: set[tuple[int, int]]) -> list[tuple[int, int, int]]:
-    """(line, first, end) of unbroken runs of edges (line, place)."""
-    runs: list[tuple[int, int, int]] = []
-    for line, place in sorted(edges):
-        if runs and runs[-1][0] == line and runs[-1][2] == place:
-            runs[-1] = (line, runs[-1][1], place + 1)
-        else:
-            runs.append((line, place, place + 1))
-    return runs
+    def wall(self, edge: Edge) -> Rect:
+        """The wall between two cells, posts included."""
+        (x0, y0), (x1, y1) = self.gap(edge)
+        h, t = self.thickness / 2, self.thickness
+        return (x0 - h, y0 - t, x1 + h, y1 + t) if x0 == x1 else (x0 - t, y0 - h, x1 + t, y1 + h)
 
 
 def maze(draw: Draw, rng: np.random.Generator) -> Layout:
-    """The layout of `maze`."""
-    nx, ny, pitch, behind = round(draw("columns")), round(draw("rows")), draw("pitch"), draw("behind")
-    thickness = rng.uniform(0.15, 0.25)
-    entry, leave = int(rng.integers(ny)), int(rng.integers(ny))
-    first, last = (0, entry), (nx - 1, leave)
-    parent = _grown(nx, ny, first, rng)
-    while (opened := _shortcut(parent, last)) is None:
-        parent = _grown(nx, ny, first, rng)
+    """A maze between a stem in which the robot starts and an exit on the far side, beyond which the goal lies."""
+    hedges = rng.random() < HEDGES
+    width = draw("width")
+    thickness = rng.uniform(0.5, 0.7) if hedges else rng.uniform(0.15, 0.3)
+    columns, rows = int(draw("columns")), int(draw("rows"))
+    grid = _Grid(columns, rows, width + thickness, thickness)
+    ways, opened, entry, out, trip = _ways(grid, draw, rng)
+    shut = [e for e in grid.edges if e not in ways and e not in opened]
 
-    def centre(cell: Cell) -> np.ndarray:
-        return np.array([cell[0] * pitch, (cell[1] - entry) * pitch])
+    role = "hedge" if hedges else "wall"
+    solids, plugs, doorposts = [], [], []
+    rects = [grid.wall(e) for e in shut]
+    depth = thickness + width - WAY  # to either side of the wall half of what WAY leaves; the other half is clutter's
+    kinds = [k for k in (HEDGE_KINDS if hedges else WALL_KINDS) if fits(k, width, depth)]
 
-    left, bottom = -pitch / 2, (-entry - 0.5) * pitch
-    right, top = left + nx * pitch, bottom + ny * pitch
-    upright = {(i, j) for i in range(nx + 1) for j in range(ny)} - {(0, entry), (nx, leave)}  # (line, row)
-    level = {(j, i) for j in range(ny + 1) for i in range(nx)}  # (line, column)
-    for (i, j), before in [*((c, p) for c, p in parent.items() if p is not None), opened]:
-        if before[1] == j:
-            upright.discard((max(i, before[0]), j))
-        else:
-            level.discard((max(j, before[1]), i))
-    (a, b), half = opened, pitch / 2
-    middle = (centre(a) + centre(b)) / 2
-    across = np.array([0.0, half]) if a[1] == b[1] else np.array([half, 0.0])
-    plug = wall((middle[0] - across[0], middle[1] - across[1]), (middle[0] + across[0], middle[1] + across[1]), thickness)
+    def kind() -> str:
+        return kinds[rng.integers(len(kinds))]
 
-    solids: list[Solid] = []
-    for line, begin, end in _runs(upright):
-        x = left + line * pitch
-        solids.append(wall((x, bottom + begin * pitch), (x, bottom + end * pitch), thickness))
-    for line, begin, end in _runs(level):
-        y = bottom + line * pitch
-        solids.append(wall((left + begin * pitch, y), (left + end * pitch, y), thickness))
-    solids += wings(left, bottom, top, thickness)
-    way = np.array([centre(c) for c in reversed(_back(parent, last))])
-    goal = (right + behind, float(np.clip(centre(last)[1] + rng.uniform(-2, 2), bottom, top)))
-    out = np.array([[right + 0.5, centre(last)[1]], goal])
-    hull = (left - thickness, bottom - thickness, right + thickness, top + thickness)
+    busy: set[int] = set()  # cells beside something
+    for k, e in enumerate(opened):
+        busy |= set(e)
+        made = close(kind(), *grid.gap(e), thickness, depth, rng, number=k, wall=role)
+        solids, plugs, doorposts = solids + made.both, plugs + made.closed, doorposts + made.opened
+    # The same things where both twins are open, and where both are closed.
+    for k in range(int(draw("decoys"))):
+        left = [e for e in (shut if k % 2 else sorted(ways)) if not busy & set(e)]
+        if not left:
+            continue
+        e = left[int(rng.integers(len(left)))]
+        if e in shut:
+            rects.remove(grid.wall(e))
+        busy |= set(e)
+        made = close(kind(), *grid.gap(e), thickness, depth, rng, number=100 + k, wall=role)
+        solids += made.fixed(is_open=e in ways)
+
+    stem = draw("stem")
+    hull = (0.0, 0.0, columns * grid.pitch, rows * grid.pitch)
+    solids += [box(r, role) for r in cover([*rects, *_outside(grid, hull, entry, out, stem), *_posts(grid)])]
+    h, far = thickness / 2, hull[2]
+    for y0, y1 in ((-WING, -h), (hull[3] + h, hull[3] + WING)):
+        solids.append(box((-h, y0, h, y1), role))
+    (_, y), (_, goal_y) = grid.centre(entry), grid.centre(out)
+    start = (-stem + rng.uniform(0.8, 1.5), y)
+    goal = (far + draw("behind"), goal_y + rng.uniform(-1.5, 1.5))
+    solids += _corner_posts(grid, busy, width, rng)
+    line = np.array([start, *(grid.centre(n) for n in trip), (far, goal_y), goal])
     return Layout(
-        solids=solids, plugs=[plug], doorposts=[], ways=[np.concatenate([way, out])], hull=hull, start=(0.0, 0.0), goal=goal
+        solids=solids,
+        plugs=plugs,
+        doorposts=doorposts,
+        ways=[line],
+        hull=(-stem, -h, far + h, hull[3] + h),
+        start=start,
+        goal=goal,
     )
 
 
-LAYOUTS = {"maze": maze}
+def _ways(grid: _Grid, draw: Draw, rng: np.random.Generator) -> tuple[set[Edge], list[Edge], int, int, list[int]]:
+    """Passages of both twins, those only of the open one, the cells at entry and exit, and the closed twin's way."""
+    winding, share, wanted, more = draw("winding"), draw("loops"), int(draw("decisions")), int(draw("more"))
+    length = dict.fromkeys(grid.edges, 1.0)
+    best: tuple | None = None
+    for _ in range(TRIES):
+        entry = grid.columns * int(rng.integers(grid.rows))
+        out = grid.columns * int(rng.integers(grid.rows)) + grid.columns - 1
+        tree = networks.grow(grid.edges, int(rng.integers(grid.columns * grid.rows)), winding, rng)
+        ways = networks.braid(grid.edges, tree, share, rng)
+        trip = networks.route(ways, length, entry, out).nodes
+        branches = networks.side_branches(ways, trip)
+        leads = set().union(*branches.values()) if branches else set()
+        shut = [e for e in grid.edges if e not in ways and (e[0] in leads) != (e[1] in leads)]
+        short = networks.shortcuts(shut, ways, length, entry, out, SAVING)
+        if short and (best is None or len(branches) > best[0]):
+            best = (len(branches), ways, short, leads, entry, out, trip)
+        if best is not None and best[0] >= wanted:
+            break
+    if best is None:
+        raise RuntimeError(f"{TRIES} mazes of {grid.columns} x {grid.rows} cells had no shortcut.")  # none ever did
+    _, ways, short, leads, entry, out, trip = best
+    opened = [short[int(rng.integers(min(3, len(short))))]]
+    others = [e for e in grid.edges if e not in ways and e not in opened and (e[0] in leads) != (e[1] in leads)]
+    for k in rng.permutation(len(others))[:more]:
+        opened.append(others[k])
+    return ways, opened, entry, out, trip
+
+
+def _outside(grid: _Grid, hull: Rect, entry: int, out: int, stem: float) -> list[Rect]:
+    """The outer walls with a way in and a way out, and the two sides of the stem."""
+    h, (x0, y0, x1, y1) = grid.thickness / 2, hull
+    half = (grid.pitch - grid.thickness) / 2
+    rects = [(x0 - h, y0 - h, x1 + h, y0 + h), (x0 - h, y1 - h, x1 + h, y1 + h)]
+    for x, node in ((x0, entry), (x1, out)):
+        _, y = grid.centre(node)
+        rects += [(x - h, y0 - h, x + h, y - half), (x - h, y + half, x + h, y1 + h)]
+    _, y = grid.centre(entry)
+    return [*rects, (-stem, y - half - 2 * h, h, y - half), (-stem, y + half, h, y + half + 2 * h)]
+
+
+def _posts(grid: _Grid) -> list[Rect]:
+    """Posts of the grid: what passages are jambed by where no wall ends."""
+    h = grid.thickness / 2
+    return [
+        (i * grid.pitch - h, j * grid.pitch - h, i * grid.pitch + h, j * grid.pitch + h)
+        for i in range(1, grid.columns)
+        for j in range(1, grid.rows)
+    ]
+
+
+def _corner_posts(grid: _Grid, busy: set[int], width: float, rng: np.random.Generator) -> list[Solid]:
+    """Bollards and crates in corners of cells, where the passages are wide enough to leave WAY."""
+    size = (width - WAY) / 2
+    if size < 0.3:
+        return []
+    solids = []
+    count = grid.columns * grid.rows
+    for k, node in enumerate(rng.permutation(count)[: count // 6].tolist()):
+        if node in busy:
+            continue
+        (x, y), reach = grid.centre(node), rng.uniform(0.12, min(size / 2, 0.35))
+        sx, sy = rng.choice([-1.0, 1.0], 2)
+        x, y = x + sx * (width / 2 - reach), y + sy * (width / 2 - reach)
+        if rng.random() < 0.5:
+            solids.append(post(x, y, reach, f"barrel:{k}", rng.uniform(0.7, 1.4)))
+        else:
+            rect = (x - reach, y - reach, x + reach, y + reach)
+            solids.append(box(rect, f"crate:{k}", 0.0, rng.uniform(0.6, 1.4)))
+    return solids

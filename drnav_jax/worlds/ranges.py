@@ -134,23 +134,48 @@ RANGES: dict[str, dict[str, tuple[Range | None, Range]]] = {
         "count": ((6, 12), (4, 16)),  # obstacles between them
     },
     "maze": {
-        "columns": ((5, 7), (4, 8)),  # cells along the trip
-        "rows": ((4, 5), (3, 6)),  # cells across it
-        "pitch": ((2.0, 2.6), (1.8, 3.0)),  # of the cells
-        "behind": ((2, 4), (2, 5)),  # maze to goal
+        "columns": ((5, 9), (5, 11)),  # cells along the trip: 5 to 8, 5 to 10
+        "rows": ((4, 8), (4, 10)),  # cells across: 4 to 7, 4 to 9
+        "width": ((1.6, 2.3), (1.5, 2.6)),  # of the passages
+        "winding": ((0.5, 0.95), (0.2, 1)),  # 0 = short branches, 1 = long ones
+        "loops": ((0, 0.06), (0, 0.1)),  # probability that a wall which no tree needs open is open
+        "decisions": ((2, 5), (2, 7)),  # branches off the way that lead nowhere, at least
+        "more": ((0, 3), (0, 4)),  # dead ends that the open twin has open beside the shortcut
+        "decoys": ((2, 7), (2, 9)),  # things in passages that both twins have open or closed
+        "stem": ((5, 7), (4, 8)),  # length of the stem in which the robot starts
+        "behind": ((2, 4), (2, 5)),  # exit to goal
     },
     "office": {
-        "length": ((18, 24), (16, 28)),  # start to the far side
-        "width": ((1.8, 2.4), (1.6, 2.8)),  # of the corridors
-        "deep": ((5, 7), (4.5, 8)),  # of the rooms between them
-        "end": ((0.3, 2), (0.2, 3)),  # thickness of what closes the corridor
-        "through": ((0.1, 0.3), (0.0, 0.5)),  # share of middle rooms with two doors
-        "shut": ((0.15, 0.4), (0.1, 0.5)),  # share of rooms whose door is shut
-        "glazed": ((0.1, 0.4), (0.0, 0.6)),  # share of walls beside doors that are of glass
-        "behind": ((2, 4), (2, 5)),  # far side to goal
+        "cross": ((2, 4), (2, 4.6)),  # cross corridors: 2 or 3, in test up to 4
+        "corridors": ((2, 3.4), (2, 3.7)),  # corridors: 2 or 3
+        "width": ((1.6, 2.2), (1.5, 2.5)),  # of all of them
+        "block": ((7, 11), (6, 13)),  # between cross corridors
+        "between": ((5, 9.5), (4.5, 11)),  # between corridors: one row of rooms, or two
+        "room": ((3.5, 5), (3, 6)),  # depth of the rooms at the outer walls
+        "halls": ((0.3, 0.6), (0.2, 0.8)),  # share of the blocks that one may cross
+        "rooms": ((0.35, 0.65), (0.3, 0.7)),  # share of the rooms that stand open
+        "loops": ((0, 0.2), (0, 0.3)),  # share of the ways that no tree needs open but are
+        "decisions": ((3, 6), (3, 8)),  # shut ways and corridor ends that the trip meets, at least
+        "more": ((0, 2), (0, 3)),  # ways that the open twin has open beside the shortcut
+        "decoys": ((0.1, 0.3), (0.1, 0.4)),  # share of the open ways with an open door, empty frame, ... across
+        "standing": ((0, 6), (0, 8)),  # cabinets along the corridors
+        "stem": ((5, 7), (4, 8)),  # length of the stem in which the robot starts
+        "behind": ((2, 4), (2, 5)),  # exit to goal
     },
     "site": {
-        "count": ((4, 5), (4, 6)),  # modules
+        "columns": ((3, 5), (3, 6)),  # cells along the trip: 3 or 4, in test up to 5
+        "rows": ((3, 5), (3, 5)),  # cells across: 3 or 4
+        "cell": ((9.5, 13), (8.5, 15)),  # edge of a cell
+        "houses": ((0.3, 0.6), (0.2, 0.7)),  # share of the cells that are houses, not yards
+        "loops": ((0, 0.1), (0, 0.15)),  # share of the ways that no tree needs open but are
+        "winding": ((0.4, 0.9), (0.2, 1)),  # 0 = short branches, 1 = long ones
+        "branches": ((2, 4), (2, 5)),  # that leave the trip and lead nowhere, at least
+        "decisions": ((4, 10), (4, 12.9)),  # branches, blind corridors and culs-de-sac on the trip
+        "more": ((0, 2), (0, 3)),  # ways that the open twin has open beside the shortcut
+        "decoys": ((0.2, 0.5), (0.1, 0.6)),  # share of the walls that look like a way that is shut
+        "plain": ((0.2, 0.5), (0.1, 0.6)),  # share of the ways in which nothing stands
+        "stem": ((5, 7), (4, 8)),  # length of the lane in which the robot starts
+        "behind": ((3, 5), (2, 6)),  # gate to goal
     },
 }
 TURN = ((-5.0, 5.0), (-15.0, 15.0))  # of every layout, beyond a multiple of 90 degrees
