@@ -101,6 +101,7 @@ def sense(
         key: Randomness of the sensors.
     """
     held, params = FilterSpec(), FilterParams()
+    params = params._replace(occupancy=params.occupancy._replace(max_range=sensors.lidar.max_range))
 
     def look(state: Any, pose: Array, k: Array) -> tuple[Any, tuple]:
         points, valid = lidar.scan(spec.lidar, sensors.lidar, world, pose, jax.random.fold_in(key, k))

@@ -25,6 +25,7 @@ from drnav_jax.worlds.frames import frames
 from drnav_jax.worlds.truth import GroundTruth, interior, truth
 
 ROWS = 64  # solids of a shard's worlds are padded to a multiple of this, so that shards share programs
+SHORT = 0.35  # share of worlds whose LiDAR sees less far than 12 m
 OTHER = 500_000  # beyond the seeds of `pairs`: the second world of a family that has no twin
 
 
@@ -48,6 +49,7 @@ def _sensors(spec: FrameSpec, rng: np.random.Generator) -> Sensors:
     rig = RigSpec(tuple(_mount(m, rng) for m in spec.rig.mounts), spec.rig.shape)
     return Sensors(
         lidar=LidarParams(
+            max_range=rng.uniform(5.0, 12.0) if rng.random() < SHORT else 12.0,
             noise_std=rng.uniform(0.01, 0.03), dropout=rng.uniform(0.0, 0.05), height=rng.uniform(0.4, 0.6)
         ),
         camera=CameraParams(noise_std=rng.uniform(0.005, 0.03), blur=rng.uniform(0.0, 0.15)),

@@ -2,7 +2,8 @@
 
 Ways are shortest ways over the true map at `CLEARANCE` (the search graph of `worlds.paths`), their corners every
 `SPACING` metres. A tour goes into cells of pockets: those of the closed twin for both twins, so that the same places are
-looked at whether they are dead ends or not.
+looked at whether they are dead ends or not. Half of the episodes begin at the scene's start, the others anywhere from
+where the goal can be reached, or large worlds would be known by their first rooms only.
 """
 
 import math
@@ -18,7 +19,8 @@ from drnav_jax.worlds.paths import Graph, search_graph, trace
 CLEARANCE = 0.35  # [m] from the robot's centre to the walls
 SPACING = 0.5  # [m] between corners
 NUM_POINTS = 96  # L
-NEAR = 12.0  # [m] by way from the start: how far off a random place may lie
+NEAR = 12.0  # [m] by way from where the episode begins: how far off a random place may lie
+ELSEWHERE = 0.5  # share of the episodes that do not begin at the scene's start
 LEGS = 8  # most places of a way
 
 
@@ -78,7 +80,10 @@ def draw(scene: Scene, pockets: np.ndarray, kind: str, seed: int) -> Plan:
         raise ValueError(f"{scene.name}: frames are gathered on a trip; give the scene a start and a goal.")
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     graph = search_graph(scene, CLEARANCE)
-    first, goal = _node_at(graph, scene.start[:2]), _node_at(graph, scene.goal)
+    begin, goal = _node_at(graph, scene.start[:2]), _node_at(graph, scene.goal)
+    first = begin
+    if rng.random() < ELSEWHERE:
+        first = int(rng.choice(np.flatnonzero(np.isfinite(csgraph.dijkstra(graph.edges, indices=goal)))))
     cost = csgraph.dijkstra(graph.edges, indices=first, limit=2 * NEAR)
     near = np.flatnonzero(cost <= NEAR)
     deep = _nodes_where(graph, pockets, scene.origin, scene.resolution)
@@ -94,8 +99,9 @@ def draw(scene: Scene, pockets: np.ndarray, kind: str, seed: int) -> Plan:
         points = np.concatenate([[scene.goal], graph.points(rng.choice(anywhere, LEGS))])
     else:
         points = _way(graph, source, places, rng)
-    xy = graph.points(np.array([source]))[0] if source != first else np.asarray(scene.start[:2])
-    yaw = rng.uniform(-math.pi, math.pi) if kind in ("errand", "wall") else scene.start[2]
+    given = source == begin
+    xy = np.asarray(scene.start[:2]) if given else graph.points(np.array([source]))[0]
+    yaw = scene.start[2] if given and kind in ("tour", "reach") else rng.uniform(-math.pi, math.pi)
     points = np.concatenate([points, np.repeat(points[-1:], NUM_POINTS - len(points), axis=0)])
     fields: dict[str, Any] = {
         "kind": np.int32(KINDS.index(kind)),

@@ -45,9 +45,9 @@ class DatasetSpec:
     split: str
     seed: int
     families: tuple[str, ...]
-    ticks: int = 10
-    num_worlds: int = 16
-    per_world: int = 32
+    ticks: int = 12
+    num_worlds: int = 24
+    per_world: int = 20
 
     def __post_init__(self) -> None:
         """Check ranges."""
