@@ -5,25 +5,26 @@ import functools
 import math
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from drnav_jax import metrics, navigator, worlds
-from drnav_jax.models import geometric, oracle, silent
+from drnav_jax.models import fusion, geometric, oracle, silent, weights
 from drnav_jax.navigator import NavParams, NavSpec
 from drnav_jax.planning.compositions import planner
 from drnav_jax.planning.goal_generator import GeneratorSpec
-from drnav_jax.sim import episode, mjx
+from drnav_jax.sim import CameraParams, episode, mjx
 from drnav_jax.sim.episode import EpisodeParams, EpisodeSpec
 from drnav_jax.sim.lidar import LidarParams
 from drnav_jax.sim.mjx import MjxSpec
-from drnav_jax.types import GridMap, RobotParams
+from drnav_jax.types import GridMap, RigSpec, RobotParams
 from drnav_jax.worlds import Scene
 from drnav_jax.worlds.truth import TruthSpec, truth
 
-PREDICTORS = ("geometric", "oracle", "none")
+PREDICTORS = ("fusion", "geometric", "oracle", "none")
 PHYSICS = ("kinematic", "mjx")
 STEP_LENGTH = 0.0125  # [m] that the fastest robot moves in one time step of MJX: how deep it may enter an obstacle
 LABEL_RESOLUTION = 0.1  # [m] labels need no finer grid
@@ -35,7 +36,8 @@ class Setup:
 
     Attributes:
         planner: A row of `planning.compositions`.
-        predictor: Where dead-end evidence comes from: geometric, oracle or none.
+        predictor: Where dead-end evidence comes from: fusion, geometric, oracle or none.
+        weights: File of the fusion network's weights; None = those that come with the package.
         risk_weight: Lambda of eq. 7 and of the route's cell cost; None = the planner's default.
         horizon: H [s]; None = the planner's default.
         robot_radius: [m].
@@ -52,6 +54,7 @@ class Setup:
 
     planner: str = "drnav"
     predictor: str = "geometric"
+    weights: Path | None = None
     risk_weight: float | None = None
     horizon: float | None = None
     robot_radius: float = 0.25
@@ -85,12 +88,14 @@ class Setup:
             raise ValueError(f"num_candidates must be >= 320, got {self.num_candidates}.")
 
 
-def with_physics(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
-    """The spec of episodes with the setup's physics in it; a fast robot is simulated in shorter time steps.
+def equipped(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
+    """The spec of episodes with the setup's cameras and physics; a fast robot is simulated in shorter time steps.
 
     Raises:
         ValueError: If `mjx_boxes` is out of range.
     """
+    if setup.predictor == "fusion":
+        spec = dataclasses.replace(spec, rig=RigSpec())
     if setup.physics == "kinematic":
         return dataclasses.replace(spec, physics=None)
     steps = math.ceil(spec.dt * max(setup.max_speed, 1.0) / STEP_LENGTH - 1e-9)
@@ -108,9 +113,16 @@ class Trip(NamedTuple):
 
 
 @functools.cache
-def spec_of(planner_name: str, predictor: str, num_candidates: int) -> NavSpec:
-    """The robot's spec: 256 headings, the other candidates are controls."""
-    predict = {"geometric": geometric.predict, "oracle": oracle.predict, "none": silent.predict}[predictor]
+def trained(file: Path | None) -> weights.Trained:
+    """The weights of a file, or those that come with the package."""
+    return weights.load(weights.SHIPPED if file is None else file)
+
+
+@functools.cache
+def spec_of(planner_name: str, predictor: str, num_candidates: int, file: Path | None = None) -> NavSpec:
+    """The robot's spec: 256 headings, the other candidates are controls; `file` holds the fusion network's weights."""
+    without = {"geometric": geometric.predict, "oracle": oracle.predict, "none": silent.predict}
+    predict = without[predictor] if predictor in without else fusion.predictor(trained(file).spec)
     speeds = 12 if num_candidates < 2048 else 16
     generator = GeneratorSpec(num_speeds=speeds, num_turns=(num_candidates - 256) // speeds, num_headings=256)
     return NavSpec(planner=planner(planner_name), predictor=predict, generator=generator)
@@ -146,7 +158,7 @@ def prepare(scenes: list[Scene], setup: Setup) -> list[Trip]:
         ValueError: If a start or goal is not free, or no way joins them, or the world is too large for the physics;
             says where and what to do.
     """
-    physics = with_physics(EpisodeSpec(), setup).physics
+    physics = equipped(EpisodeSpec(), setup).physics
     if physics is not None:
         mjx.solids_of([scene.world for scene in scenes], physics)
     margin = plan_margin(NavParams())
@@ -189,9 +201,10 @@ def params_of(setup: Setup) -> NavParams:
     if setup.horizon is not None:
         score = score._replace(horizon=setup.horizon)
     occupancy = params.filter.occupancy._replace(max_range=setup.lidar_range)
-    predictor: Any = {
-        "geometric": geometric.GeometricParams(radius=setup.robot_radius), "oracle": None, "none": None,
-    }[setup.predictor]  # fmt: skip
+    rule = geometric.GeometricParams(radius=setup.robot_radius)
+    predictor: Any = {"geometric": rule}.get(setup.predictor)
+    if setup.predictor == "fusion":
+        predictor = fusion.params_of(trained(setup.weights), rule=rule)
     return params._replace(
         robot=robot, score=score, route=route, predictor=predictor,
         filter=params.filter._replace(occupancy=occupancy),
@@ -219,7 +232,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
     batch = len(trips)
     spread = lambda tree: _stack([tree] * batch)  # noqa: E731
-    physics = with_physics(EpisodeSpec(), setup).physics
+    physics = equipped(EpisodeSpec(), setup).physics
     every = [t.scene.world for t in trips]
     solids = () if physics is None else mjx.solids_of(every, physics)
     return EpisodeParams(
@@ -231,6 +244,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         robot=spread(params.robot),
         policy=_stack(each),
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
+        camera=spread(CameraParams()),
         faults=spread(episode.FaultParams()),
         motors=() if physics is None else spread(mjx.MjxParams()),
         solids=solids,
@@ -275,8 +289,8 @@ def evaluate(
     begin = time.perf_counter()
     batch = episode_params(trips, setup, params)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
-    policy = policy_of(spec_of(setup.planner, setup.predictor, setup.num_candidates))
-    result = episode.run(with_physics(spec, setup), policy, batch, keys, progress=progress)
+    policy = policy_of(spec_of(setup.planner, setup.predictor, setup.num_candidates, setup.weights))
+    result = episode.run(equipped(spec, setup), policy, batch, keys, progress=progress)
     kept = [k for k in range(len(trips)) if result.finished[k]]
     if not kept:
         raise KeyboardInterrupt

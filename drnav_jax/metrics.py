@@ -1,4 +1,4 @@
-"""Figures of merit of episodes (paper, section V-A; Anderson et al. 2018 for SPL; the BARN challenge for its score).
+"""Figures of merit of episodes (paper, section V-A; Anderson et al. 2018 for SPL; BARN for its score) and of detection.
 
 efficiency = straight-line distance / distance driven
 SPL        = success * shortest / max(shortest, distance driven)
@@ -111,3 +111,67 @@ def ratio_of_means(
     ratios = ours[draw].mean(axis=1) / theirs[draw].mean(axis=1)
     low, high = np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2])
     return float(ours.mean() / theirs.mean()), float(low), float(high)
+
+
+def _pair(scores: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scores, truth = np.asarray(scores, float).ravel(), np.asarray(truth, bool).ravel()
+    if scores.shape != truth.shape:
+        raise ValueError(f"scores and truth must have one shape, got {scores.size} and {truth.size} values.")
+    return scores, truth
+
+
+def auroc(scores: np.ndarray, truth: np.ndarray) -> float:
+    """Area under the ROC curve: the chance that a true one scores higher than a false one, ties counting half.
+
+    Args:
+        scores: Any shape.
+        truth: The same shape, bool.
+
+    Returns:
+        nan where all are true or all are false.
+    """
+    scores, truth = _pair(scores, truth)
+    positives, negatives = int(truth.sum()), int((~truth).sum())
+    if not positives or not negatives:
+        return float("nan")
+    values, place = np.unique(scores, return_inverse=True)
+    yes, no = (np.bincount(place[kind], minlength=values.size).astype(float) for kind in (truth, ~truth))
+    below = np.cumsum(no) - no
+    return float(np.sum(yes * (below + 0.5 * no)) / (positives * negatives))
+
+
+def average_precision(scores: np.ndarray, truth: np.ndarray) -> float:
+    """Area under the precision-recall curve as a sum over recall steps; nan where nothing is true."""
+    scores, truth = _pair(scores, truth)
+    if not truth.any():
+        return float("nan")
+    values, place = np.unique(-scores, return_inverse=True)
+    hits = np.cumsum(np.bincount(place, weights=truth, minlength=values.size))
+    taken = np.cumsum(np.bincount(place, minlength=values.size))
+    gained = np.diff(hits, prepend=0.0) / truth.sum()
+    return float(np.sum(gained * hits / taken))
+
+
+def calibration_error(probability: np.ndarray, truth: np.ndarray, bins: int = 15) -> float:
+    """Expected calibration error: |mean probability - share that is true|, over equal bins, weighted by their counts."""
+    probability, truth = _pair(probability, truth)
+    if not truth.size:
+        return float("nan")
+    place = np.clip((probability * bins).astype(int), 0, bins - 1)
+    gap = np.bincount(place, weights=probability - truth, minlength=bins)
+    return float(np.abs(gap).sum() / truth.size)
+
+
+def f1(said: np.ndarray, truth: np.ndarray) -> float:
+    """Harmonic mean of precision and recall; nan where nothing is true and nothing was said."""
+    said, truth = np.asarray(said, bool), np.asarray(truth, bool)
+    over = int(said.sum()) + int(truth.sum())
+    return 2.0 * int((said & truth).sum()) / over if over else float("nan")
+
+
+def balanced_accuracy(said: np.ndarray, truth: np.ndarray) -> float:
+    """Mean of the shares of true and of false ones that were named right; nan where one kind is missing."""
+    said, truth = np.asarray(said, bool).ravel(), np.asarray(truth, bool).ravel()
+    if truth.all() or not truth.any():
+        return float("nan")
+    return float((said[truth].mean() + (~said[~truth]).mean()) / 2)

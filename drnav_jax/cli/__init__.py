@@ -8,11 +8,11 @@ from pathlib import Path
 import jax
 
 from drnav_jax import __version__, bench, report
-from drnav_jax.cli import data, drive
-from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Trial, Worlds, parse
+from drnav_jax.cli import data, drive, learn
+from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Train, Trial, Worlds, parse
 from drnav_jax.cli.terminal import INTERRUPTED, stdout_kept
 
-__all__ = ["Bench", "Command", "Compare", "Dataset", "Run", "Trial", "Worlds", "main", "parse"]
+__all__ = ["Bench", "Command", "Compare", "Dataset", "Run", "Train", "Trial", "Worlds", "main", "parse"]
 
 
 def _measure(args: Bench) -> int:
@@ -30,6 +30,8 @@ def _perform(args: Command) -> int:
             return data.show(args)
         case Dataset():
             return data.gather(args)
+        case Train():
+            return learn.perform(args)
         case Bench():
             return _measure(args)
 

@@ -46,7 +46,7 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
     names = [args.planner] if isinstance(args, Run) else [name.strip() for name in args.planners.split(",")]
     if len(set(names)) < len(names):
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
-    same = ("predictor", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
+    same = ("predictor", "weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
     common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
     return {name: evaluate.Setup(planner=name, **common) for name in names}
 
@@ -113,7 +113,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
     believers = [name for name in finished.evaluations if planner(name).risk_in_route or planner(name).exposure]
     first = (believers or list(finished.evaluations))[0]
     setup, evaluation = setups[first], finished.evaluations[first]
-    spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates)
+    spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates, setup.weights)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
     for number, k in enumerate(evaluation.kept[:PICTURES], 1):
         trip = trips[k]
@@ -124,7 +124,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
                 path = evaluate.path_driven(e.result, k, trip.scene.start)
                 drives[name] = report.Drive(path, e.records[e.kept.index(k)])
         batch = jax.tree.map(lambda a: a[0], evaluate.episode_params([trip], setup))
-        states = episode.replay(evaluate.with_physics(SPEC, setup), evaluate.policy_of(spec), batch, keys[k])
+        states = episode.replay(evaluate.equipped(SPEC, setup), evaluate.policy_of(spec), batch, keys[k])
         path = drives[first].path
         every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
         believed = report.believe(states, spec.filter, path, SPEC.dt, every)

@@ -37,6 +37,7 @@ class Trial:
         goal: Where it shall go [m, m].
         episodes: Worlds of a family; sampled trips on a map; repeats, with other sensor noise, of a given trip.
         predictor: Where dead-end evidence comes from.
+        weights: Of the fusion network, from `drnav train`.
         risk_weight: Lambda of eq. 1 and 7; 0 = dead ends do not matter.
         horizon: H, how far ahead candidates are rolled out [s].
         seed: Of sensor noise and of sampled trips.
@@ -61,7 +62,8 @@ class Trial:
     start: Annotated[str | None, _flag("X,Y,YAW", "default: the world's own, or sampled")] = None
     goal: Annotated[str | None, _flag("X,Y", "default: the world's own, or sampled")] = None
     episodes: Annotated[int, _flag("N")] = 1
-    predictor: Literal["geometric", "oracle", "none"] = "geometric"
+    predictor: Literal["fusion", "geometric", "oracle", "none"] = "geometric"
+    weights: Annotated[Path | None, _flag("FILE", "default: those that come with drnav")] = None
     risk_weight: Annotated[float | None, _flag("F", "default: the planner's")] = None
     horizon: Annotated[float | None, _flag("S", "default: the planner's, 4 s")] = None
     seed: Annotated[int, _flag("N")] = 0
@@ -151,12 +153,36 @@ class Dataset:
     json: bool = False
 
 
-Command: TypeAlias = Run | Compare | Worlds | Dataset | Bench
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train the fusion network.
+
+    Attributes:
+        out: Folder for checkpoints, logs and weights.
+        data: Folder of a training set (`drnav dataset`).
+        stream: Gather frames while training, in worlds without end.
+        validation: Folder of a validation set (`drnav dataset --split val`).
+        config: YAML or JSON file of settings (`train.TrainSpec`), such as `steps: 6000`.
+        resume: Go on from the last checkpoint in --out.
+        json: Print the figures as one JSON object on stdout, and nothing else there.
+    """
+
+    out: Annotated[Path, _flag("DIR")]
+    validation: Annotated[Path, _flag("DIR")]
+    data: Annotated[Path | None, _flag("DIR", "")] = None
+    stream: bool = False
+    config: Annotated[Path | None, _flag("FILE", "")] = None
+    resume: bool = False
+    json: bool = False
+
+
+Command: TypeAlias = Run | Compare | Worlds | Dataset | Train | Bench
 _COMMANDS = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Compare, tyro.conf.subcommand("compare")]
     | Annotated[Worlds, tyro.conf.subcommand("worlds")]
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
 )
 

@@ -28,12 +28,12 @@ class Bar:
             self.stream.write(f"{self.name:>14}  {text}\n")
         self.stream.flush()
 
-    def __call__(self, done: int, made: int | None = None) -> None:
-        """Take note of how many are done, and how many of these were made since the bar began (None: all)."""
+    def __call__(self, done: int, made: int | None = None, note: str = "") -> None:
+        """Take note of how many are done, how many of these were made since the bar began (None: all), and what to add."""
         self.done, spent = done, time.perf_counter() - self.begin
         rate = (done if made is None else made) / spent
         left = f", {rate:.2f}/s, {(self.total - done) / rate:.0f} s left" if rate > 0 else ""
-        self._show(f"{spent:.0f} s{left}")
+        self._show(f"{spent:.0f} s{left}" + (f", {note}" if note else ""))
 
     def close(self) -> None:
         """Leave one line behind."""

@@ -4,6 +4,7 @@ from drnav_jax.dataset.frames import STRATUM_BITS, Frame, FrameSpec
 from drnav_jax.dataset.job import families_of, outline, page, spec_of, table, write
 from drnav_jax.dataset.loader import FrameSource, batches
 from drnav_jax.dataset.shards import DatasetSpec, read_manifest, verify
+from drnav_jax.dataset.stream import stream
 
 __all__ = [
     "STRATUM_BITS",
@@ -17,6 +18,7 @@ __all__ = [
     "page",
     "read_manifest",
     "spec_of",
+    "stream",
     "table",
     "verify",
     "write",

@@ -2,8 +2,8 @@
 
 Ways are shortest ways over the true map at `CLEARANCE` (the search graph of `worlds.paths`), their corners every
 `SPACING` metres. A tour goes into cells of pockets: those of the closed twin for both twins, so that the same places are
-looked at whether they are dead ends or not. Half of the episodes begin at the scene's start, the others anywhere from
-where the goal can be reached, or large worlds would be known by their first rooms only.
+looked at whether they are dead ends or not. Half of the episodes begin at the scene's start, the others anywhere around
+pockets, or large worlds would be known by their first rooms only; random places lie around pockets too.
 """
 
 import math
@@ -21,6 +21,7 @@ SPACING = 0.5  # [m] between corners
 NUM_POINTS = 96  # L
 NEAR = 12.0  # [m] by way from where the episode begins: how far off a random place may lie
 ELSEWHERE = 0.5  # share of the episodes that do not begin at the scene's start
+AROUND = 6.0  # [m] by way from a pocket
 LEGS = 8  # most places of a way
 
 
@@ -82,13 +83,18 @@ def draw(scene: Scene, pockets: np.ndarray, kind: str, seed: int) -> Plan:
     graph = search_graph(scene, CLEARANCE)
     begin, goal = _node_at(graph, scene.start[:2]), _node_at(graph, scene.goal)
     first = begin
-    if rng.random() < ELSEWHERE:
-        first = int(rng.choice(np.flatnonzero(np.isfinite(csgraph.dijkstra(graph.edges, indices=goal)))))
-    cost = csgraph.dijkstra(graph.edges, indices=first, limit=2 * NEAR)
-    near = np.flatnonzero(cost <= NEAR)
     deep = _nodes_where(graph, pockets, scene.origin, scene.resolution)
+    around = np.isfinite(csgraph.dijkstra(graph.edges, indices=goal))
+    if len(deep):
+        around &= csgraph.dijkstra(graph.edges, indices=deep, limit=AROUND, min_only=True) <= AROUND
+    if around.any() and rng.random() < ELSEWHERE:
+        first = int(rng.choice(np.flatnonzero(around)))
+    cost = csgraph.dijkstra(graph.edges, indices=first, limit=2 * NEAR)
+    near = np.flatnonzero((cost <= NEAR) & around)
     anywhere = near if len(near) else np.array([first])
     if kind == "tour":
+        close = deep[np.isfinite(cost[deep])]
+        deep = close if len(close) else deep
         source, places = first, [deep, anywhere] * (LEGS // 2 - 1) + [np.array([goal])]
     else:
         source, places = int(rng.choice(anywhere)), [anywhere] * LEGS

@@ -19,10 +19,11 @@ import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
 from drnav_jax.sim import contact, kinematic, lidar, mjx
+from drnav_jax.sim.camera import CameraParams, render
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
 from drnav_jax.sim.mjx import MjxSpec
-from drnav_jax.types import Command, Observation, RobotParams, empty_observation
+from drnav_jax.types import NO_CAMERAS, Command, Observation, RigSpec, RobotParams, empty_observation
 from drnav_jax.worlds.world import World
 
 
@@ -46,6 +47,7 @@ class EpisodeSpec:
 
     Attributes:
         lidar: The beams.
+        rig: The cameras; they take images in ticks that replan, which is when a predictor looks at them.
         dt: Tick [s].
         replan_every: Ticks per replan.
         chunk_ticks: Ticks per compiled call; a multiple of `replan_every`.
@@ -55,6 +57,7 @@ class EpisodeSpec:
     """
 
     lidar: LidarSpec = LidarSpec()
+    rig: RigSpec = NO_CAMERAS
     dt: float = 0.1
     replan_every: int = 5
     chunk_ticks: int = 50
@@ -89,6 +92,7 @@ class EpisodeParams(NamedTuple):
     robot: RobotParams  # the true robot
     policy: Any  # the policy's parameters
     lidar: LidarParams = LidarParams()
+    camera: CameraParams = CameraParams()
     faults: FaultParams = FaultParams()
     motors: Any = ()  # `mjx.MjxParams` if the physics is MJX
     solids: Any = ()  # `solids.Solids` of the world if the physics is MJX
@@ -140,9 +144,13 @@ def tick(
     """Sense, decide, move, judge: once. A finished episode stays as it is."""
     key_scan, key_policy = jax.random.split(jax.random.fold_in(state.key, state.tick))
     points, valid = lidar.scan(spec.lidar, params.lidar, params.world, state.pose, key_scan)
-    observation = empty_observation(points.shape[0])._replace(
+    observation = empty_observation(points.shape[0], spec.rig)._replace(
         points=points, point_valid=valid, pose=state.odometry, twist=state.twist, goal=params.goal
     )
+    if spec.rig.mounts and replan:
+        key_image = jax.random.fold_in(key_scan, 1)
+        images = render(spec.rig, params.camera, params.world, observation.rig, state.pose, key_image)
+        observation = observation._replace(images=images, image_valid=jnp.ones(len(spec.rig.mounts), bool))
     mind, command, log = policy.step(params.policy, state.policy, observation, key_policy, replan)
     pending, reached = kinematic.delayed(state.pending, command, spec.dt, params.faults)
     body, grazed = (), jnp.asarray(jnp.inf, jnp.float32)

@@ -1,0 +1,65 @@
+"""`drnav train`: data sets in, weights out."""
+
+import os
+import sys
+
+import jax
+
+from drnav_jax import dataset, report, train
+from drnav_jax.cli.flags import Train
+from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.models.batch import Batch, batch_of
+
+CHUNK = 64  # validation frames at a time
+
+
+def _devices() -> None:
+    """Without an accelerator each core is a device of its own: parts of a batch then never wait for each other."""
+    if jax.config.values["jax_platforms"] in ("cpu", None) and jax.config.values["jax_num_cpu_devices"] < 1:
+        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
+
+
+def _validation(args: Train) -> list[Batch]:
+    source = dataset.FrameSource(args.validation)
+    count = len(source) // CHUNK * CHUNK
+    if not count:
+        raise ValueError(f"{args.validation} holds {len(source)} frames: validation needs at least {CHUNK}.")
+    return [batch_of(f._asdict()) for f in dataset.batches(args.validation, CHUNK, 0, epochs=1, workers=0)]
+
+
+def perform(args: Train) -> int:
+    """Train; the exit code.
+
+    Raises:
+        ValueError: On a user's mistake.
+        OSError: If a file cannot be read or written.
+    """
+    if args.stream == (args.data is not None):
+        raise ValueError("give either --data DIR or --stream.")
+    spec = train.read(args.config)
+    _devices()
+    if args.data is not None:
+        folder = args.data
+        source = lambda first: dataset.batches(folder, spec.batch_size, spec.seed, first=first)  # noqa: E731
+    else:
+        worlds = dataset.spec_of(1, "train", spec.seed)
+        source = lambda first: dataset.stream(spec.batch_size, worlds, first=first)  # noqa: E731
+    bar = Bar("train", spec.steps, "steps")
+    try:
+        with stdout_kept(args.json):
+            said = lambda step, figures: bar(step, note=_note(figures))  # noqa: E731
+            result = train.train(spec, source, _validation(args), args.out, resume=args.resume, progress=said)
+    except KeyboardInterrupt:
+        print(f"drnav: interrupted; the same command with --resume goes on in {args.out}/", file=sys.stderr)
+        return INTERRUPTED
+    finally:
+        bar.close()
+    figures = result.figures | {"step": result.step, "samples_per_s": result.samples_per_s}
+    print(report.dumps(figures) if args.json else "\n".join(f"{name:<20} {v:.4g}" for name, v in figures.items()))
+    print(f"drnav: wrote {args.out / 'weights.safetensors'}", file=sys.stderr)
+    return 0
+
+
+def _note(figures: dict[str, float]) -> str:
+    names = ("loss", "samples_per_s", "accuracy", "interior_auroc")
+    return ", ".join(f"{name} {figures[name]:.3g}" for name in names if name in figures)

@@ -1,0 +1,124 @@
+"""The fusion network as a predictor: cameras, LiDAR and the known map -> evidence on the rolling window.
+
+The network answers on a grid that turns with the robot; its answer is brought into the window, cell by cell. How much a
+cell's answer weighs:
+
+    (1)  confidence(c) = weight · m(twist) · w(c)
+    (2)  w = 1 where a sensor has seen the cell free, `unseen` where it has not but has seen one within `NEAR`, else 0
+    (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
+
+`weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper).
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from drnav_jax import geometry
+from drnav_jax.models import bev, calibration, geometric, network
+from drnav_jax.models.batch import FREE, OCCUPIED, Inputs
+from drnav_jax.models.calibration import Calibration
+from drnav_jax.models.geometric import GeometricParams
+from drnav_jax.models.network import NetworkSpec, Outputs
+from drnav_jax.models.weights import Trained
+from drnav_jax.types import Evidence, GridMap, LocalMap, Observation, Scalar
+
+NEAR = 2.0  # [m] eq. 2
+FAR_GOAL = 1e4  # [m] the rule is asked without a goal, as in training
+
+
+class FusionParams(NamedTuple):
+    """Weights, and how far to trust them."""
+
+    network: Any  # from `network.init` or `weights.load`
+    calibration: Calibration = Calibration()
+    weight: Scalar = 0.35  # [] of one frame's answer
+    unseen: Scalar = 0.6  # [] w of eq. 2
+    still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
+    moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
+    rule: GeometricParams = GeometricParams()  # an input of the network, and the answer where there is no camera
+
+
+def params_of(trained: Trained, **changes: Any) -> FusionParams:
+    """Parameters from a file of weights."""
+    return FusionParams(trained.params, trained.calibration)._replace(**changes)
+
+
+def inputs_of(spec: NetworkSpec, params: FusionParams, observation: Observation, local_map: LocalMap) -> Inputs:
+    """What the network reads, as a batch of one."""
+    asked = observation._replace(goal=jnp.full(2, FAR_GOAL, jnp.float32))
+    rule = geometric.predict(params.rule, asked, local_map)
+    at = lambda values: bev.resample(  # noqa: E731
+        spec.bev, GridMap(values, local_map.origin, local_map.resolution), observation.pose, 0.0
+    )
+    fields: dict[str, Any] = {
+        "images": observation.images, "image_valid": observation.image_valid, "points": observation.points,
+        "point_valid": observation.point_valid, "rig": observation.rig,
+        "local_map": bev.classes(spec.bev, local_map, observation.pose),
+        "rule_p": at(rule.p_dead), "rule_confidence": at(rule.confidence),
+    }  # fmt: skip
+    return jax.tree.map(lambda a: jnp.asarray(a)[None], Inputs(**fields))
+
+
+def answer(spec: NetworkSpec, params: FusionParams, observation: Observation, local_map: LocalMap) -> Outputs:
+    """The network's calibrated outputs, without batch axis: ways, flag, cells in the robot's frame, saliency."""
+    out = network.apply(spec, params.network, inputs_of(spec, params, observation, local_map))
+    return jax.tree.map(lambda a: a[0], calibration.calibrated(params.calibration, out))
+
+
+def _grown(mask: Array, cells: int) -> Array:
+    """Cells within `cells` of true ones, along rows and columns."""
+    grown = jax.lax.reduce_window(
+        mask.astype(jnp.float32), -jnp.inf, jax.lax.max, (2 * cells + 1, 2 * cells + 1), (1, 1), "SAME"
+    )
+    return grown > 0
+
+
+def trust(
+    spec: NetworkSpec, params: FusionParams, observation: Observation, known: Array
+) -> Float[Array, "h w"]:
+    """Eqs. 1 to 3 on the network's grid; `known` holds the classes of `models.bev`."""
+    seen = known == FREE
+    near = _grown(seen, round(NEAR / spec.bev.resolution)) & (known != OCCUPIED)
+    where = jnp.where(seen, 1.0, jnp.where(near, params.unseen, 0.0))
+    speed = jnp.max(jnp.abs(observation.twist)) / jnp.maximum(params.moving, 1e-3)
+    moves = params.still + (1.0 - params.still) * jnp.minimum(speed, 1.0)
+    return (params.weight * moves * where).astype(jnp.float32)
+
+
+def evidence(
+    spec: NetworkSpec, pose: Float[Array, "3"], p_dead: Array, confidence: Array, local_map: LocalMap
+) -> Evidence:
+    """From the network's grid to the window: each of its cells reads the network's cell under its centre."""
+    h, w = local_map.occupancy.shape
+    x, y = geometry.cell_centres((h, w), local_map.origin, local_map.resolution)
+    odom = jnp.stack(jnp.broadcast_arrays(x, y), axis=-1)
+    local = geometry.transform(geometry.inverse(pose), odom)
+    origin = jnp.asarray(spec.bev.origin, jnp.float32)
+    grid = lambda values: GridMap(values, origin, jnp.asarray(spec.bev.resolution, jnp.float32))  # noqa: E731
+    return Evidence(
+        p_dead=geometry.sample_nearest(grid(p_dead), local, fill=0.0),
+        confidence=geometry.sample_nearest(grid(confidence), local, fill=0.0),
+    )
+
+
+@functools.cache
+def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMap], Evidence]:
+    """The predictor of a network; the same function for the same Spec, so that nothing compiles twice."""
+
+    def predict(params: FusionParams, observation: Observation, local_map: LocalMap) -> Evidence:
+        """Evidence of the network; of the geometric rule for a robot without cameras."""
+        if not observation.images.shape[0]:
+            return geometric.predict(params.rule, observation, local_map)
+        out = answer(spec, params, observation, local_map)
+        known = bev.classes(spec.bev, local_map, observation.pose)
+        sound = jnp.isfinite(out.dead)
+        p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
+        confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
+        return evidence(spec, observation.pose, p_dead, confidence, local_map)
+
+    return predict
