@@ -167,7 +167,10 @@ class MBConv(nn.Module):
         """Apply it; the input is added where shapes allow it."""
         act, c = ACTIVATIONS[self.activation], x.shape[-1]
         bias = self.norm == "block"
-        inside = lambda name, y: jnp.asarray(y if bias else Norm(self.norm, name=name)(y))  # noqa: E731
+
+        def inside(name: str, y: Array) -> Array:
+            return y if bias else Norm(self.norm, name=name)(y)
+
         y = Norm("layer", name="norm")(x) if self.norm == "block" else x
         if self.expand > 1:
             y = act(inside("expand_norm", Dense(c * self.expand, bias=bias, name="expand")(y)))

@@ -154,6 +154,7 @@ def fitted(spec: TrainSpec, params: Any, validation: Iterable[Batch]) -> Calibra
     """Temperatures from the validation frames."""
     raw = validate.predict(spec.network, params, validation)
     t = raw.targets
+    assert raw.dead is not None
     logit = lambda p: np.log(np.clip(p, 1e-6, 1 - 1e-6)) - np.log1p(-np.clip(p, 1e-6, 1 - 1e-6))  # noqa: E731
     dead = raw.dead.astype(np.float32) / 65535
     return Calibration(

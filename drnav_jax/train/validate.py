@@ -1,9 +1,10 @@
-"""How good a network is on labelled frames: the figures of Table I (host code over batched inference).
+"""How good evidence is on labelled frames: the figures of Table I (host code over batched inference).
 
-Probabilities are kept in 1/65535, one array per head, so that tens of thousands of frames fit in memory.
+Whoever judges - a network, the geometric rule, a language model - gives `Predictions`; `figures` compares them with the
+truth, `intervals` says how far another draw of worlds would move them. Probabilities of cells are kept in 1/65535.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -14,40 +15,84 @@ from scipy import ndimage
 
 from drnav_jax import metrics
 from drnav_jax.models import calibration, network
-from drnav_jax.models.batch import NEVER, Batch
+from drnav_jax.models.batch import NEVER, OCCUPIED, Batch, Inputs, Targets
 from drnav_jax.models.calibration import Calibration
 from drnav_jax.models.network import NetworkSpec
+from drnav_jax.types import BevSpec
+from drnav_jax.worlds.labels import clearance_of
+from drnav_jax.worlds.openings import Floor, openings
 
 RAW = Calibration()
 NEAR_SEEN = 2.0  # [m] never-seen cells count this close to seen ones; what lies farther off nobody can know
 
 
 class Predictions(NamedTuple):
-    """What was said of F frames, and what is true; NumPy arrays on axis 0."""
+    """What was said of F frames, and what is true; NumPy arrays on axis 0. NaN = no answer."""
 
     path: np.ndarray  # [F, 3] probability of being open
     flag: np.ndarray  # [F] probability of the dead-end flag
-    dead: np.ndarray  # [F, h, w] probability of being a dead end, uint16 in 1/65535
+    dead: np.ndarray | None  # [F, h, w] probability of being a dead end, uint16 in 1/65535; None = says nothing of cells
     targets: Any  # `Targets`
 
 
 @partial(jax.jit, static_argnames="spec")
-def _probabilities(spec: NetworkSpec, params: Any, temper: Calibration, inputs: Any) -> tuple[Any, Any, Any]:
+def _probabilities(spec: NetworkSpec, params: Any, temper: Calibration, inputs: Inputs) -> tuple[Any, Any, Any]:
     out = calibration.calibrated(temper, network.apply(spec, params, inputs))
     dead = jnp.round(jax.nn.sigmoid(out.dead) * 65535).astype(jnp.uint16)
     return jax.nn.sigmoid(out.path), jax.nn.sigmoid(out.flag), dead
 
 
 def predict(
-    spec: NetworkSpec, params: Any, batches: Iterable[Batch], temper: Calibration = RAW
-) -> Predictions:
-    """Run a network over batches of one size."""
+    spec: NetworkSpec, params: Any, batches: Iterable[Batch], temper: Calibration = RAW,
+    change: Callable[[Inputs], Inputs] | None = None,
+) -> Predictions:  # fmt: skip
+    """Run a network over batches of one size.
+
+    Args:
+        spec: Of the network.
+        params: Its parameters.
+        batches: Frames.
+        temper: Temperatures.
+        change: What is done to the inputs first, such as a camera that goes missing.
+    """
     parts, targets = [], []
     for batch in batches:
-        parts.append(jax.device_get(_probabilities(spec, params, temper, batch.inputs)))
+        inputs = batch.inputs if change is None else change(batch.inputs)
+        parts.append(jax.device_get(_probabilities(spec, params, temper, inputs)))
         targets.append(jax.tree.map(np.asarray, batch.targets))
     path, flag, dead = (np.concatenate(p) for p in zip(*parts, strict=True))
     return Predictions(path, flag, dead, jax.tree.map(lambda *a: np.concatenate(a), *targets))
+
+
+def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Predictions:
+    """What the geometric rule says; of ways, what its verdict on the known map leaves open, unknown counting as free."""
+    path, flag, dead, targets = [], [], [], []
+    pose = np.zeros((1, 3))
+    for batch in batches:
+        x = batch.inputs
+        p = np.asarray(x.rule_p).astype(np.float32) / 255
+        sure = np.asarray(x.rule_confidence).astype(np.float32) / 255
+        closed = (p > 0.1) & (sure > 0)  # the rule knows two answers: see `GeometricParams`
+        for verdict, known in zip(closed, np.asarray(x.local_map), strict=True):
+            floor = Floor(
+                label=verdict, depth=np.zeros(verdict.shape), origin=np.asarray(bev.origin), resolution=bev.resolution,
+                standable=clearance_of(known == OCCUPIED, bev.resolution) > radius, outside_is_free=True,
+            )
+            found = openings(floor, pose)
+            path.append(found.open[0])
+            flag.append(found.dead_end[0])
+        dead.append(np.round(p * sure * 65535).astype(np.uint16))
+        targets.append(jax.tree.map(np.asarray, batch.targets))
+    return Predictions(
+        np.asarray(path, np.float32), np.asarray(flag, np.float32), np.concatenate(dead),
+        jax.tree.map(lambda *a: np.concatenate(a), *targets),
+    )  # fmt: skip
+
+
+def only(found: Predictions, frames: np.ndarray) -> Predictions:
+    """Of some frames (mask or numbers)."""
+    dead = None if found.dead is None else found.dead[frames]
+    return Predictions(found.path[frames], found.flag[frames], dead, jax.tree.map(lambda a: a[frames], found.targets))
 
 
 def near_seen(visibility: np.ndarray, resolution: float) -> np.ndarray:
@@ -55,31 +100,41 @@ def near_seen(visibility: np.ndarray, resolution: float) -> np.ndarray:
     found = np.zeros(visibility.shape, bool)
     for k, codes in enumerate(visibility):
         unseen = codes == NEVER
-        if unseen.all():
-            continue
-        found[k] = unseen & (np.asarray(ndimage.distance_transform_edt(unseen)) * resolution <= NEAR_SEEN)
+        if not unseen.all():
+            found[k] = unseen & (np.asarray(ndimage.distance_transform_edt(unseen)) * resolution <= NEAR_SEEN)
     return found
 
 
+def _of_ways(found: Predictions) -> dict[str, float]:
+    t = found.targets
+    asked = np.isfinite(found.path)
+    open_, stable = found.path >= 0.5, asked & t.path_stable
+    right = open_ == t.path
+    flagged = np.isfinite(found.flag)
+    share = lambda mask: float(right[mask].mean()) if mask.any() else float("nan")  # noqa: E731
+    return {
+        "accuracy": share(asked),
+        "accuracy_stable": share(stable),
+        "balanced_accuracy": metrics.balanced_accuracy(open_[asked], t.path[asked]),
+        "dead_end_f1": metrics.f1(found.flag[flagged] >= 0.5, t.dead_end_flag[flagged]),
+    }
+
+
 def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
-    """Accuracy of ways, F1 of the flag, AUROC and AP of cells, interior AUROC, calibration error.
+    """Accuracy of ways, F1 of the flag, AUROC and AP of cells, interior AUROC, calibration errors; nan = undefined.
 
     Args:
-        found: From `predict`.
+        found: From `predict` or `by_rule`.
         resolution: Of the grid [m].
     """
     t = found.targets
-    open_ = found.path >= 0.5
-    right = open_ == t.path
-    out = {
-        "accuracy": float(right.mean()),
-        "accuracy_stable": float(right[t.path_stable].mean()) if t.path_stable.any() else float("nan"),
-        "balanced_accuracy": metrics.balanced_accuracy(open_, t.path),
-        "dead_end_f1": metrics.f1(found.flag >= 0.5, t.dead_end_flag),
-    }
+    out = _of_ways(found)
+    if found.dead is None:
+        names = ("cell_auroc", "cell_auroc_unseen", "cell_ap", "interior_auroc", "ece")
+        return out | dict.fromkeys(names, float("nan"))
     dead = found.dead.astype(np.float32) / 65535
     inner, unseen = t.interior & t.valid, near_seen(t.visibility, resolution) & t.valid
-    out |= {
+    return out | {
         "cell_auroc": metrics.auroc(dead[t.valid], t.dead_end[t.valid]),
         "cell_auroc_unseen": metrics.auroc(dead[unseen], t.dead_end[unseen]),
         "cell_ap": metrics.average_precision(dead[t.valid], t.dead_end[t.valid]),
@@ -87,4 +142,54 @@ def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
         "ece": metrics.calibration_error(dead[t.valid], t.dead_end[t.valid]),
         "ece_path": metrics.calibration_error(found.path, t.path),
     }
+
+
+def worlds_of(targets: Targets) -> np.ndarray:
+    """Number of the world of each frame; twins count as one, since they share all but an end."""
+    pairs = np.stack([np.asarray(targets.family), np.asarray(targets.seed)], axis=1)
+    return np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
+
+
+def intervals(
+    found: Predictions, names: tuple[str, ...] = ("accuracy", "accuracy_stable", "dead_end_f1", "interior_auroc"),
+    *, seed: int = 0, resamples: int = 200, level: float = 0.95, bins: int = 512,
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """Bootstrap intervals over worlds, since frames of one world are much alike.
+
+    Args:
+        found: From `predict`.
+        names: Of `accuracy`, `accuracy_stable`, `dead_end_f1`, `interior_auroc` and `cell_auroc`.
+        seed: Of the resampling.
+        resamples: Number of bootstrap samples.
+        level: Of the intervals.
+        bins: Steps of probability that AUROC tells apart.
+    """
+    t, world = found.targets, worlds_of(found.targets)
+    count = int(world.max()) + 1
+    frames = [np.flatnonzero(world == k) for k in range(count)]
+    cells = {}
+    if found.dead is not None:
+        step = (found.dead.astype(np.int64) * bins) >> 16
+        for name, mask in (("interior_auroc", t.interior & t.valid), ("cell_auroc", t.valid)):
+            code = step + bins * t.dead_end
+            cells[name] = np.stack([np.bincount(code[f][mask[f]], minlength=2 * bins) for f in frames])
+    rng, drawn = np.random.default_rng(seed), {name: [] for name in names}
+    slim = t._replace(**{name: t.family for name, values in t._asdict().items() if np.ndim(values) == 3})
+    slim = found._replace(dead=None, targets=slim)
+    for _ in range(resamples):
+        chosen = rng.integers(0, count, count)
+        ways = _of_ways(only(slim, np.concatenate([frames[k] for k in chosen])))
+        for name in names:
+            if name in cells:
+                no, yes = cells[name][chosen].sum(axis=0).reshape(2, bins).astype(float)
+                below = np.cumsum(no) - no
+                over = yes.sum() * no.sum()
+                drawn[name].append(float(np.sum(yes * (below + 0.5 * no)) / over) if over else float("nan"))
+            else:
+                drawn[name].append(ways.get(name, float("nan")))
+    ends = [(1 - level) / 2, (1 + level) / 2]
+    out = {}
+    for name, values in drawn.items():
+        low, high = np.nanquantile(values, ends) if np.isfinite(values).any() else (float("nan"),) * 2
+        out[name] = (float(low), float(high))
     return out

@@ -57,6 +57,17 @@ class OpeningSpec:
             )
 
 
+class Floor(NamedTuple):
+    """What is asked of a `GroundTruth` here, for grids that are none: what a rule believes, say."""
+
+    label: Bool[np.ndarray, "H W"]  # dead ends
+    depth: Float[np.ndarray, "H W"]  # of them [m]
+    standable: Bool[np.ndarray, "H W"]  # F
+    origin: Float[np.ndarray, "2"]  # x, y of the outer corner of cell (0, 0) [m]
+    resolution: float  # [m]
+    outside_is_free: bool  # whether one may drive beyond the grid
+
+
 class Openings(NamedTuple):
     """What N robots have before them; sectors in the order of `SECTORS`."""
 
@@ -67,7 +78,7 @@ class Openings(NamedTuple):
 
 
 def openings(
-    truth: GroundTruth,
+    truth: GroundTruth | Floor,
     poses: Float[np.ndarray, "N 3"],
     spec: OpeningSpec = OpeningSpec(),  # noqa: B008 (immutable)
 ) -> Openings:
@@ -100,7 +111,7 @@ def openings(
 
 
 def _open(
-    truth: GroundTruth, poses: Float[np.ndarray, "n M 3"], spec: OpeningSpec
+    truth: GroundTruth | Floor, poses: Float[np.ndarray, "n M 3"], spec: OpeningSpec
 ) -> tuple[Bool[np.ndarray, "n M 3"], Bool[np.ndarray, "n M"]]:
     """Eq. 1 for n robots, each in M poses about its first; and which of them are in F."""
     n, m = poses.shape[:2]
@@ -146,7 +157,7 @@ def _open(
 
 
 def _crops(
-    truth: GroundTruth, rows: Int[np.ndarray, "n L"], columns: Int[np.ndarray, "n L"]
+    truth: GroundTruth | Floor, rows: Int[np.ndarray, "n L"], columns: Int[np.ndarray, "n L"]
 ) -> tuple[Bool[np.ndarray, "n L L"], Bool[np.ndarray, "n L L"], Float[np.ndarray, "n L L"]]:
     """F, dead ends and depth [m] in windows, which may reach beyond the grid."""
     h, w = truth.label.shape

@@ -1,0 +1,189 @@
+"""Table I: who sees dead ends?
+
+    python experiments/table1_detection.py --split test --json
+
+Frames of worlds that nobody was trained on are gathered once (`--out`/frames-...), then judged by the fusion network, by
+networks that lack a sensor or a part, by the geometric rule, by CLIP and by a vision-language model. Ways are OPEN or
+BLOCKED for front, left and right; cells carry a probability of being a dead end. Intervals are bootstrapped over worlds.
+
+Rows `image_only`, `lidar_only`, `no_attention`, `no_lift` and `tokens` are networks of their own, trained with
+`drnav train --config experiments/ablations/ROW.yaml` and read from `--ablations`/ROW.safetensors.
+"""
+
+import dataclasses
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import numpy as np
+import tyro
+
+from drnav_jax import dataset, report, worlds
+from drnav_jax.models import network, weights
+from drnav_jax.models.batch import Batch, batch_of
+from drnav_jax.train import validate
+from drnav_jax.train.validate import Predictions
+from drnav_jax.types import BevSpec, RigSpec
+
+COLUMNS = (
+    "accuracy", "accuracy_stable", "balanced_accuracy", "dead_end_f1", "cell_auroc", "cell_auroc_unseen", "cell_ap",
+    "interior_auroc", "ece", "latency_ms", "throughput_hz", "parameters",
+)  # fmt: skip
+ABLATIONS = ("image_only", "lidar_only", "no_attention", "no_lift", "tokens")
+CHUNK = 60  # frames per call; shards hold 480
+REPEATS = 50  # of the timed call
+HERE = Path(__file__).resolve().parent
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What is judged, and where results go.
+
+    Attributes:
+        split: Of the worlds: test has sizes and two families that training never had, val only other seeds.
+        frames: How many.
+        seed: Of the worlds.
+        weights: Of the fusion network; None = those that come with the package.
+        ablations: Folder of the other networks' weights.
+        out: Folder for frames, table and picture.
+        json: Print one JSON object on stdout, and nothing else there.
+    """
+
+    split: Literal["test", "val"] = "test"
+    frames: int = 3840
+    seed: int = 100
+    weights: Path | None = None
+    ablations: Path = HERE / "ablations"
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("results") / "table1"
+    json: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the number of frames."""
+        if self.frames < CHUNK or self.frames % CHUNK:
+            raise ValueError(f"--frames must be a multiple of {CHUNK}, got {self.frames}.")
+
+
+def gathered(config: Config) -> tuple[list[Batch], tuple[str, ...]]:
+    """The frames, gathered unless they are there already, and the families' names."""
+    folder = config.out / f"frames-{config.split}-{config.seed}-{config.frames}"
+    spec = dataset.spec_of(config.frames, config.split, config.seed)
+    begun = time.perf_counter()
+
+    def said(done: int, _: int) -> None:
+        print(f"table1: {done}/{config.frames} frames, {time.perf_counter() - begun:.0f} s", file=sys.stderr)
+
+    dataset.write(folder, spec, progress=said)
+    frames = dataset.batches(folder, CHUNK, 0, epochs=1, workers=0)
+    return [batch_of(frame._asdict()) for frame in frames], spec.families
+
+
+def latency(trained: weights.Trained, num_points: int) -> float:
+    """Median time of one answer [ms]: three cameras, one scan, one frame."""
+    inputs = network.example(trained.spec, RigSpec(), num_points)
+    inputs = jax.tree.map(lambda a: np.ones_like(a) if a.dtype == bool else a, jax.device_get(inputs))
+    spent = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        jax.block_until_ready(network.infer(trained.spec, trained.params, inputs))
+        spent.append(time.perf_counter() - begun)
+    return 1e3 * float(np.median(spent))
+
+
+def row(found: Predictions, extra: dict[str, Any]) -> dict[str, Any]:
+    """One row of the table, with intervals."""
+    values = validate.figures(found) | extra
+    return {name: _number(values.get(name)) for name in (*COLUMNS, "ece_path") if name in values} | {
+        "intervals": {name: [_number(a), _number(b)] for name, (a, b) in validate.intervals(found).items()}
+    }
+
+
+def _number(value: Any) -> Any:
+    """JSON has no NaN: what is undefined is null."""
+    return None if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
+
+
+def of_network(file: Path, batches: list[Batch]) -> tuple[Predictions, dict[str, Any]] | None:
+    """What the network of a file says, its speed and size; None where there is no such file."""
+    if not file.is_file():
+        return None
+    trained = weights.load(file)
+    found = validate.predict(trained.spec, trained.params, batches, trained.calibration)
+    ms = latency(trained, batches[0].inputs.points.shape[1])
+    return found, {"latency_ms": ms, "throughput_hz": 1e3 / ms, "parameters": network.count(trained.params)}
+
+
+def by_family(found: Predictions, families: tuple[str, ...], wanted: tuple[str, ...]) -> dict[str, Any]:
+    """Figures of each family."""
+    out = {}
+    for name in wanted:
+        of_it = np.asarray(found.targets.family) == families.index(name)
+        if of_it.any():
+            part = validate.only(found, of_it)
+            out[name] = {k: _number(v) for k, v in validate.figures(part).items()} | {"frames": int(of_it.sum())}
+    return out
+
+
+def by_stratum(found: Predictions) -> dict[str, Any]:
+    """Interior AUROC where something is in view that one sensor alone cannot judge."""
+    out = {}
+    for name, bit in dataset.STRATUM_BITS.items():
+        seen = (np.asarray(found.targets.strata_seen) & bit) > 0
+        if seen.any():
+            value = validate.figures(validate.only(found, seen))["interior_auroc"]
+            out[name] = {"interior_auroc": _number(value), "frames": int(seen.sum())}
+    return out
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Judge and write the table."""
+    config.out.mkdir(parents=True, exist_ok=True)
+    batches, families = gathered(config)
+    files = {"drnav": config.weights or weights.SHIPPED}
+    files |= {name: config.ablations / f"{name}.safetensors" for name in ABLATIONS}
+    rows, strata, ours, per_family = {}, {}, None, {}
+    for name, file in files.items():
+        said = of_network(file, batches)
+        if said is None:
+            rows[name] = {"note": "weights not available"}
+            continue
+        rows[name], strata[name] = row(*said), by_stratum(said[0])
+        per_family[name] = by_family(said[0], families, families)
+        ours = said[0] if name == "drnav" else ours
+    begun = time.perf_counter()
+    rule = validate.by_rule(batches, BevSpec(), 0.25)
+    ms = 1e3 * (time.perf_counter() - begun) / len(rule.path)
+    rows["geometric"] = row(rule, {"parameters": 0})
+    rows["geometric"]["note"] = f"judging the ways on the rule's map took {ms:.1f} ms per frame on the host"
+    per_family["geometric"], strata["geometric"] = by_family(rule, families, families), by_stratum(rule)
+    held = tuple(name for name in families if name in worlds.HELD_OUT)
+    known = tuple(name for name in families if name not in held)
+    pick = lambda names: {  # noqa: E731
+        who: {name: values[name] for name in names if name in values} for who, values in per_family.items()
+    }
+    result = {
+        "experiment": "table1_detection", "split": config.split, "seed": config.seed, "frames": config.frames,
+        "rows": rows, "strata": strata, "families": pick(known), "unseen_families": pick(held),
+    }  # fmt: skip
+    (config.out / f"table1-{config.split}-{config.seed}.json").write_text(report.dumps(result) + "\n")
+    if ours is None:
+        print("table1: there are no weights of the fusion network; train some with `drnav train`.", file=sys.stderr)
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    """The rows as text."""
+    lines = [f"{'':14}" + "".join(f"{name[:12]:>13}" for name in COLUMNS)]
+    for name, values in result["rows"].items():
+        cells = [values.get(column) for column in COLUMNS]
+        shown = (f"{v:>13,}" if isinstance(v, int) else f"{'-':>13}" if v is None else f"{v:>13.3f}" for v in cells)
+        lines.append(f"{name:14}" + "".join(shown) + (f"  {values['note']}" if "note" in values else ""))
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    asked = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
+    done = main(asked)
+    print(report.dumps(done) if asked.json else table(done))
