@@ -2,7 +2,7 @@
 
 With the mask m and the weight w of a cell, z the logit, y the truth, and sums over all cells of all frames
 
-    (1)  w(c)   = m(c) [w_v(visibility) + w_i interior(c)]              where the twin's label differs is the real question
+    (1)  w(c)   = m(c) w_v(visibility) [1 + w_i interior(c)]            where the twin's label differs is the real question
     (2)  L_dead = Σ w (1 - p_y)^γ BCE(z, y) / Σ w                       γ = 0: cross-entropy, which stays calibrated
     (3)  L_path = Σ s BCE(z, y) / Σ s,  s = 1 if the label is stable, else `unstable`;  L_flag likewise
     (4)  L_trav over all cells inside the world, L_rec over the valid ones; L_depth = |log(1 + d̂) - log(1 + d)| (Huber)
@@ -30,7 +30,7 @@ class LossParams(NamedTuple):
     """Weights of the loss."""
 
     before: Scalar = 1.0  # [] w_v of cells seen earlier (1 for those seen now)
-    never: Scalar = 1.5  # [] w_v of cells never seen
+    never: Scalar = 0.4  # [] w_v of cells never seen: of most of them nobody can know
     interior: Scalar = 4.0  # [] w_i of eq. 1
     gamma: Scalar = 0.0  # [] γ of eq. 2
     unstable: Scalar = 0.4  # [] weight of path and flag labels that a step aside changes
@@ -64,7 +64,7 @@ def sums(params: LossParams, outputs: Outputs, targets: Targets) -> dict[str, tu
     valid, dead = real(targets.valid), real(targets.dead_end)
     seen = jnp.where(targets.visibility == BEFORE, params.before, 1.0)
     seen = jnp.where(targets.visibility == NEVER, params.never, seen)
-    weight = valid * (seen + params.interior * real(targets.interior))
+    weight = valid * seen * (1.0 + params.interior * real(targets.interior))
     stable = lambda a: jnp.where(a, 1.0, params.unstable)  # noqa: E731
     depth = jnp.log1p(jnp.maximum(real(targets.depth), 0.0))
     bce = optax.sigmoid_binary_cross_entropy
