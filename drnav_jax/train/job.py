@@ -146,6 +146,7 @@ def train(
         weights.save(out / "weights.safetensors", spec.network, best.average, temper, {"figures": result.figures})
         return result
     finally:
+        getattr(frames, "close", lambda: None)()  # the processes that read ahead
         kept.close()
         log.close()
 
