@@ -32,10 +32,10 @@ demo: $(STAMP)  ## one trap, with and without dead-end prediction
 	$(BIN)/drnav compare $(DEMO_ARGS)
 
 test: $(STAMP)  ## the tests, but for the slow ones
-	$(BIN)/python -m pytest -q -m "not slow" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile $(PYTEST_ARGS)
 
-test-all: $(STAMP)  ## every test
-	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+test-all: $(STAMP)  ## every test, as users compile it
+	XLA_FLAGS="$(XLA_FLAGS)" $(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
 lint: $(STAMP)  ## ruff and pyright; layout is by hand (comments in columns), so no format check
 	$(BIN)/ruff check .

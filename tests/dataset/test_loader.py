@@ -7,14 +7,15 @@ from drnav_jax.dataset import loader, shards
 from drnav_jax.dataset.frames import Frame
 from drnav_jax.dataset.shards import DatasetSpec
 
-SHARD = 512  # frames of a shard
+WORLDS, EACH = 16, 32  # of a shard
+SHARD = WORLDS * EACH  # frames of a shard, as many as `make` makes
 COUNT = SHARD + 9
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, make):
     out = tmp_path_factory.mktemp("frames")
-    shards.write(out, DatasetSpec(COUNT, "train", 0, ("u", "t")), {}, make)
+    shards.write(out, DatasetSpec(COUNT, "train", 0, ("u", "t"), num_worlds=WORLDS, per_world=EACH), {}, make)
     return out
 
 

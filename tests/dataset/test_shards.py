@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import json
 import threading
@@ -11,8 +12,11 @@ from drnav_jax.dataset.behaviours import KINDS
 from drnav_jax.dataset.frames import Frame, dtypes
 from drnav_jax.dataset.shards import DatasetSpec
 
-SHARD, WORLDS = 512, 16  # frames and worlds of a shard
-SPEC = DatasetSpec(num_frames=2 * SHARD + 7, split="train", seed=3, families=("u", "t"))
+WORLDS, EACH = 16, 32  # worlds of a shard, frames of a world
+SHARD = WORLDS * EACH  # frames of a shard, as many as `make` makes
+SPEC = DatasetSpec(
+    num_frames=2 * SHARD + 7, split="train", seed=3, families=("u", "t"), num_worlds=WORLDS, per_world=EACH
+)  # fmt: skip
 SETTINGS = {"camera": "a"}
 
 
@@ -81,7 +85,7 @@ def test_a_folder_with_something_else_is_left_alone(tmp_path, make):
     shards.write(tmp_path, SPEC, SETTINGS, make)
     before = content(tmp_path)
     for spec, settings, name in (
-        (DatasetSpec(SPEC.num_frames, "val", 3, ("u", "t")), SETTINGS, "split"),
+        (dataclasses.replace(SPEC, split="val"), SETTINGS, "split"),
         (SPEC, {"camera": "b"}, "camera"),
     ):
         with pytest.raises(ValueError, match=f"differs in {name}.*another --out"):
@@ -126,7 +130,7 @@ def test_frames_that_cannot_be_are_refused(tmp_path, make, broken):
 
 
 def test_pairs_cover_families_and_behaviours_evenly():
-    spec = DatasetSpec(num_frames=10**5, split="train", seed=1, families=("u", "t", "l"))
+    spec = dataclasses.replace(SPEC, num_frames=10**5, seed=1, families=("u", "t", "l"))
     each = [shards.pairs(spec, k) for k in range(12)]
     assert all(len(part) == WORLDS // 2 for part in each)
     assert all([kind for *_, kind in part] == [k for k in KINDS for _ in range(2)] for part in each)
@@ -135,7 +139,7 @@ def test_pairs_cover_families_and_behaviours_evenly():
     assert len({seed for part in each for _, seed, _ in part}) == 96  # no world twice
     assert {(family, kind) for part in each for family, _, kind in part} == {(f, k) for f in spec.families for k in KINDS}
     assert shards.pairs(spec, 5) == each[5]
-    other = DatasetSpec(num_frames=10**5, split="train", seed=2, families=("u", "t", "l"))
+    other = dataclasses.replace(spec, seed=2)
     assert not {s for *_, s, _ in shards.pairs(other, 0)} & {s for part in each for _, s, _ in part}
 
 
@@ -153,6 +157,6 @@ def test_the_spec_is_checked(wrong, message):
 
 
 def test_the_manifest_is_plain_json(tmp_path, make):
-    shards.write(tmp_path, DatasetSpec(3, "val", 0, ("u", "t")), SETTINGS, make)
+    shards.write(tmp_path, dataclasses.replace(SPEC, num_frames=3), SETTINGS, make)
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     assert manifest["spec"]["num_frames"] == 3 and manifest["settings"] == SETTINGS
