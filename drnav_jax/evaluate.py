@@ -244,7 +244,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         robot=spread(params.robot),
         policy=_stack(each),
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
-        camera=spread(CameraParams()),
+        camera=spread(CameraParams()) if setup.predictor == "fusion" else (),
         faults=spread(episode.FaultParams()),
         motors=() if physics is None else spread(mjx.MjxParams()),
         solids=solids,

@@ -41,7 +41,7 @@ def shell(*argv, **kwargs):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ("", "run, compare, worlds, dataset, bench"),
+        ("", "run, compare, worlds, dataset, train, bench"),
         ("drive", "Unrecognized options: drive"),
         ("run", "exactly one of"),
         ("run --wurld u:0", "perhaps you meant --world"),

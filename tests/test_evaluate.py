@@ -133,7 +133,7 @@ def agree(singles, batched, share):
 
 
 def test_an_episode_in_a_batch_goes_as_it_goes_alone():
-    agree(whole_episodes(["u", "t"], [3], 1), whole_episodes(["u", "t"], [3], 2), 1.0)
+    agree(whole_episodes(["open"], [3, 4], 1), whole_episodes(["open"], [3, 4], 2), 1.0)
 
 
 @pytest.mark.slow

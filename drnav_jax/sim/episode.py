@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
 from drnav_jax.sim import contact, kinematic, lidar, mjx
-from drnav_jax.sim.camera import CameraParams, render
+from drnav_jax.sim.camera import render
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec
 from drnav_jax.sim.mjx import MjxSpec
@@ -92,7 +92,7 @@ class EpisodeParams(NamedTuple):
     robot: RobotParams  # the true robot
     policy: Any  # the policy's parameters
     lidar: LidarParams = LidarParams()
-    camera: CameraParams = CameraParams()
+    camera: Any = ()  # `CameraParams` if the spec's rig has cameras
     faults: FaultParams = FaultParams()
     motors: Any = ()  # `mjx.MjxParams` if the physics is MJX
     solids: Any = ()  # `solids.Solids` of the world if the physics is MJX
@@ -259,13 +259,15 @@ def run(
         Results of all episodes. After a KeyboardInterrupt: as far as they got, `finished` False for the rest.
 
     Raises:
-        ValueError: If a command is delayed for longer than the spec allows for, or MJX lacks its parameters.
+        ValueError: If a command is delayed for longer than the spec allows for, or MJX or the cameras lack parameters.
     """
     longest = float(np.max(params.faults.delay)) / spec.dt
     if round(longest) > spec.max_delay:
         raise ValueError(f"faults.delay is {longest:.1f} ticks, EpisodeSpec.max_delay {spec.max_delay}: raise it.")
     if spec.physics is not None and not (params.motors and params.solids):
         raise ValueError("MJX needs EpisodeParams.motors (MjxParams) and .solids (mjx.solids_of).")
+    if spec.rig.mounts and not params.camera:
+        raise ValueError("cameras need EpisodeParams.camera (CameraParams).")
     count = keys.shape[0]
     shards = [np.arange(k, count, workers) for k in range(min(workers, count))]
     done, stop = [0] * len(shards), threading.Event()
