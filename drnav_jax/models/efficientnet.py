@@ -11,6 +11,7 @@ and a shift per channel, as batch norm has, B0 counts 5,288,548 parameters, 4,00
 
 import dataclasses
 import math
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -168,7 +169,7 @@ class MBConv(nn.Module):
         act, c = ACTIVATIONS[self.activation], x.shape[-1]
         bias = self.norm == "block"
 
-        def inside(name: str, y: Array) -> Array:
+        def inside(name: str, y: Any) -> Any:
             return y if bias else Norm(self.norm, name=name)(y)
 
         y = Norm("layer", name="norm")(x) if self.norm == "block" else x

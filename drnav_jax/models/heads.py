@@ -107,7 +107,8 @@ class GridHead(nn.Module):
         (half, quarter, eighth), (n2, n4, n8) = self.spec.widths, self.spec.blocks
         b = known.shape[0]
         fine = to_depth(known, 2)
-        place = jnp.broadcast_to(coordinates(fine.shape[1:3])[None], (b, *fine.shape[1:3], 3))
+        where = coordinates((fine.shape[1], fine.shape[2]))
+        place = jnp.broadcast_to(where[None], (b, *where.shape))
         parts = [fine, place] if lifted is None else [fine, place, lifted]
         x = nn.relu(Dense(half, name="enter")(jnp.concatenate(parts, axis=-1)))
         for k in range(n2):
