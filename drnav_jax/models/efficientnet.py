@@ -172,7 +172,7 @@ class MBConv(nn.Module):
         def inside(name: str, y: Any) -> Any:
             return y if bias else Norm(self.norm, name=name)(y)
 
-        y = Norm("layer", name="norm")(x) if self.norm == "block" else x
+        y: Any = Norm("layer", name="norm")(x) if self.norm == "block" else x
         if self.expand > 1:
             y = act(inside("expand_norm", Dense(c * self.expand, bias=bias, name="expand")(y)))
         kernel = self.param("depthwise", _depthwise_init, (self.kernel, self.kernel, y.shape[-1]))
