@@ -281,7 +281,7 @@ def _send(spec: VlmSpec, line: _Line, asked: dict[str, Any]) -> _Response:
     except urllib.error.HTTPError as error:
         with error:
             return _refusal(error, line.key)
-    except (OSError, http.client.HTTPException) as error:  # URLError is an OSError
+    except (OSError, ValueError, http.client.HTTPException) as error:  # URLError is an OSError; a host name may be no name
         reason = getattr(error, "reason", error)
         if isinstance(reason, TimeoutError):
             return late
