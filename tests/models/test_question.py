@@ -45,6 +45,7 @@ def test_what_stands_around_the_object_does_not_matter(text):
         ("", "no JSON object"),
         ("front is open, left is blocked", "no JSON object"),
         (PLAIN[:-1], "no JSON object"),
+        (PLAIN + "x" * 20_000, "no JSON object"),  # only an answer's end is read
         ("[" + '"open", ' * 3 + "false]", "no JSON object"),
         ('{"a":' * 5000, "no JSON object"),
         (json.dumps({**GOOD, "left": "closed"}), '"left" must be'),

@@ -41,6 +41,7 @@ def test_within_45_degrees_and_no_more():
     assert cameras_of(looking(44.9)) == [0, -1, -1]
     assert cameras_of(looking(45.1)) == [-1, 0, -1]
     assert cameras_of(looking(45, -45, 135, 225)) == [-1, -1, -1], "half between two ways it shows neither"
+    assert cameras_of(looking(44.999, -45.001)) == [-1, -1, -1], "nor where only rounding would tell"
 
 
 def test_a_camera_may_look_down_or_be_turned_about_its_axis_but_not_at_the_ground():
