@@ -20,6 +20,8 @@ RINGS = np.radians(np.linspace(-15, 15, 16))
 LEVEL = np.zeros(1)
 PARAMS = OccupancyParams()
 
+observed = jax.jit(occupancy.observed, static_argnums=(1, 7))  # as inside `update`: one program, not one for each operation
+
 
 def wall_distance(segments, pose, azimuths=AZIMUTHS):
     """Horizontal distance [A] from `pose` to the nearest segment (x1, y1, x2, y2); inf: none."""
@@ -138,7 +140,7 @@ def test_masks_equal_plain_loops(seed):
     shape, pose = (44, 60), rng.uniform([-1, -1, -4], [1, 1, 4]).astype(np.float32)
     points, valid = random_points(rng)
     origin = window(shape)
-    hit, crossed = occupancy.observed(
+    hit, crossed = observed(
         PARAMS,
         shape,
         origin,
@@ -169,7 +171,7 @@ def test_equals_octomap():
         pose = jnp.asarray(rng.uniform([0.5, 0.5, -3], [1.5, 1.9, 3]), jnp.float32)
         points = scan(box(0.25, 0.25, 1.75, 2.15), pose, LEVEL, noise=rng)
         args = (origin, RESOLUTION, pose, points, everything(points))
-        hit, crossed = (np.asarray(m) for m in occupancy.observed(params, shape, *args))
+        hit, crossed = (np.asarray(m) for m in observed(params, shape, *args))
         belief, seen = occupancy.update(params, belief, seen, *args)
         for i, j in zip(*np.nonzero(hit | crossed), strict=True):
             tree.updateNode(np.array([x[i, j], y[i, j], 0.05]), bool(hit[i, j]))
@@ -197,7 +199,7 @@ def test_clears_what_is_in_sight_and_nothing_else(seed):
     pose = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(-3, 3)], np.float32)
     origin = window(shape)
     points = scan(segments, pose)
-    _, crossed = occupancy.observed(PARAMS, shape, origin, RESOLUTION, jnp.asarray(pose), points, everything(points))
+    _, crossed = observed(PARAMS, shape, origin, RESOLUTION, jnp.asarray(pose), points, everything(points))
     crossed = np.asarray(crossed)
     x, y = centres(shape, origin)
     # Each cell's own line of sight, in the continuous world.
@@ -415,5 +417,5 @@ def test_a_few_noisy_returns_before_a_wall_are_no_hit():
     for points, expected in ((wall + stray, False), (stray, True)):
         cloud = jnp.asarray(points, jnp.float32)
         valid = jnp.ones(len(points), bool)
-        hit, _ = occupancy.observed(PARAMS, (40, 40), origin, 0.1, pose, cloud, valid)
+        hit, _ = observed(PARAMS, (40, 40), origin, 0.1, pose, cloud, valid)
         assert bool(hit[20, 29]) is expected

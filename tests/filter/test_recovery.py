@@ -13,6 +13,7 @@ GRID = GridSpec(shape=(100, 140), resolution=0.1)
 SPEC = RecoverySpec(grid=GRID, capacity=12)
 PARAMS = RecoveryParams()
 ORIGIN = np.array([-3.0, 2.0], np.float32)
+merge = jax.jit(recovery.merge)  # as inside `observe`
 
 
 def tee():
@@ -121,7 +122,7 @@ def test_seen_again_is_the_same_point():
 
 def test_merging_keeps_the_higher_rank_and_the_latest_sighting():
     points = as_set([[0, 0], [5, 0], [9, 9]], [4, 9, 3], [1, 1, 1])
-    merged = recovery.merge(
+    merged = merge(
         PARAMS,
         points,
         jnp.asarray([[0.5, 0.0], [5.0, 0.9], [20.0, 0.0], [30.0, 0.0]], jnp.float32),
@@ -146,7 +147,7 @@ def test_when_full_the_lowest_rank_goes_and_then_the_oldest():
     points = as_set(xy, [5] * 11 + [4], [float(i) for i in range(12)])
     new = jnp.asarray([[0.0, 50.0], [0.0, 60.0], [0.0, 70.0]], jnp.float32)
     rank = jnp.asarray([6, 5, 2], jnp.float32)
-    merged = recovery.merge(PARAMS, points, new, rank, jnp.ones(3, bool), 20.0)
+    merged = merge(PARAMS, points, new, rank, jnp.ones(3, bool), 20.0)
     kept = {tuple(map(float, p)) for p in merged.xy}
     assert bool(merged.valid.all())
     assert {(0.0, 50.0), (0.0, 60.0)} <= kept and (0.0, 70.0) not in kept

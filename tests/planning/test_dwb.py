@@ -21,6 +21,9 @@ POINTS = 48
 
 # one for each of the specs and shapes here
 plan = jax.jit(chex.assert_max_traces(dwb.plan.__wrapped__, n=4), static_argnames="spec")
+# as inside `plan`: one program, not one for each operation
+twists, rollout = (jax.jit(f, static_argnums=0) for f in (dwb.twists, dwb.rollout))
+judge, remember = jax.jit(dwb_critics.judge), jax.jit(dwb_critics.remember)
 
 
 def f32(values):
@@ -36,7 +39,7 @@ def axes(robot):
 
 
 def sampled(twist, robot=STOCK, nums=(20, 20)):
-    v, w, used = dwb.twists(DwbSpec(*nums), SAMPLING, robot, f32(twist))
+    v, w, used = twists(DwbSpec(*nums), SAMPLING, robot, f32(twist))
     return np.stack([v, w], axis=1)[np.asarray(used)]
 
 
@@ -120,7 +123,8 @@ def test_every_critic_is_that_of_the_loops(seed):
         positive_only=jnp.asarray(flags[1][:, 0]), negative_only=jnp.asarray(flags[1][:, 1]),
     )  # fmt: skip
     grid = GridMap(f32(values), f32(ORIGIN), f32(RESOLUTION))
-    got = dwb_critics.judge(PARAMS, state, grid, path, f32(pose), f32(twist), f32(goal), describe(costmap, paths, v, w))
+    got = judge(PARAMS, state, grid, path, f32(pose), f32(twist), f32(goal), describe(costmap, paths, v, w))
+    got = jax.device_get(got)
     for k, poses in enumerate(paths):
         want = reference.dwb_scores(
             PARAMS, (flags[0][0], flags[0].all()), [tuple(f) for f in flags[1]], costmap, points, pose, twist, goal,
@@ -157,8 +161,9 @@ def test_trajectories_and_the_choice_are_those_of_the_loops(robot, seed):
     path, points = make_path(rng, 0.9)
     pose, twist = np.float32([0.013, 0.017, rng.uniform(-3, 3)]), np.float32([0.1, 0.2])
     goal = np.float32([*points[-1], 1.0])
-    v, w, used = dwb.twists(spec, SAMPLING, robot, f32(twist))
-    rolled = dwb.rollout(spec, SAMPLING, robot, grid, f32(pose), f32(twist), v, w)
+    v, w, used = twists(spec, SAMPLING, robot, f32(twist))
+    rolled = jax.device_get(rollout(spec, SAMPLING, robot, grid, f32(pose), f32(twist), v, w))
+    v, w = np.asarray(v), np.asarray(w)
     scores, index, sure = [], [], True
     for k in np.flatnonzero(used):
         a, b = float(v[k]), float(w[k])
@@ -216,7 +221,7 @@ def test_trends_are_those_of_the_loops():
     for _ in range(300):
         sent = np.float32(rng.choice([-0.1, 0.0, 0.02, 0.2], 1)[0]), np.float32(rng.choice([-0.5, 0.0, 0.5]))
         pose = np.float32(pose + rng.choice([0.0, 0.01, 0.03]) * rng.choice([-1, 1], 3))
-        state = dwb_critics.remember(PARAMS, state, f32(pose), f32(sent))
+        state = remember(PARAMS, state, f32(pose), f32(sent))
         oracle.debrief(pose, *sent)
         got = tuple(zip(np.asarray(state.positive_only).tolist(), np.asarray(state.negative_only).tolist(), strict=True))
         assert got == oracle.trends()

@@ -1,5 +1,9 @@
 """Every critic against plain loops, on random maps, paths and trajectories."""
 
+import dataclasses
+import functools
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,11 +70,22 @@ def make_runs(rng, reach):
     return runs
 
 
+look = jax.jit(mppi_critics.look, static_argnums=0)
+
+
+@functools.cache
+def pricing(spec):
+    """The functions that roll-outs call, each compiled once for all comparisons."""
+    cost = mppi_critics.nav2(spec, STEPS, DT)
+    names = [name for name in ("begin", "step", "finish", "seldom") if getattr(cost, name) is not None]
+    return dataclasses.replace(cost, **{name: jax.jit(getattr(cost, name)) for name in names})
+
+
 def price(spec, scene, runs):
     """Costs of given trajectories through the functions that roll-outs call."""
     x, y, yaw, v, w = (f32(np.stack(a, axis=1)) for a in zip(*runs, strict=True))
     motion = [Motion(x=x[t], y=y[t], c=jnp.cos(yaw[t]), s=jnp.sin(yaw[t]), v=v[t], w=w[t]) for t in range(STEPS)]
-    cost = mppi_critics.nav2(spec, STEPS, DT)
+    cost = pricing(spec)
     carry = cost.begin(scene, motion[0])
     for t in range(1, STEPS):
         carry = cost.step(scene, carry, motion[t], jnp.asarray(t))
@@ -90,7 +105,7 @@ def compare(seed, spec=None, params=None, density=0.01, length=None, reach=1.0, 
     pose = np.float32([0.02, -0.01, rng.uniform(-3, 3)])
     goal_yaw = float(np.float32(rng.uniform(-3, 3)))
     words = GridMap(mppi_critics.pack(f32(values), f32(risk)), f32(ORIGIN), f32(RESOLUTION))
-    scene = mppi_critics.look(spec, params, LIMITS, INFLATION, words, path, f32(pose), goal_yaw, tolerance)
+    scene = look(spec, params, LIMITS, INFLATION, words, path, f32(pose), goal_yaw, tolerance)
     # the yaw of GoalAngle is summed up from omega, beginning at the robot's
     turned = [(x, y, pose[2] + np.cumsum(w.astype(float)) * DT, v, w) for x, y, _, v, w in runs]
     got = price(spec, scene, turned)

@@ -23,6 +23,7 @@ NUM = 150
 
 score = jax.jit(scoring.score.__wrapped__, static_argnames=("dt", "num_steps", "block_size", "reader"))
 explain = jax.jit(scoring.explain.__wrapped__, static_argnames=("dt", "num_steps", "reader"))
+path_of = jax.jit(lambda candidates, k: scoring.path_of(scoring.at(candidates, k), ROBOT, dt=DT, num_steps=STEPS))
 
 
 def f32(values):
@@ -61,7 +62,7 @@ def population(seed, num=NUM, pose=(0.0, 0.0)):
 
 
 def one_of(candidates, k):
-    m = jax.tree.map(lambda a: float(a[k]), candidates)
+    m = jax.tree.map(lambda a: float(np.asarray(a)[k]), candidates)
     yaw = np.arctan2(m.motion.s, m.motion.c)
     return {
         "pose": (m.motion.x, m.motion.y, yaw), "twist": (m.motion.v, m.motion.w), "v": m.v, "w": m.w,
@@ -74,7 +75,7 @@ def run(field, candidates, params=PARAMS, num_steps=STEPS, **static):
     best, _ = explain(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps)
     alone = score(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps, **static)
     chex.assert_trees_all_close(alone.score, best.score, atol=1e-5)
-    return best._replace(score=alone.score)
+    return jax.device_get(best._replace(score=alone.score))
 
 
 VARIANTS = [
@@ -183,7 +184,7 @@ def test_exposure_is_the_integral_along_the_path():
     got = run(field, candidates, far)
     risk = GridMap(f32(smooth), f32(ORIGIN), RESOLUTION)
     for k in range(12):
-        path = scoring.path_of(scoring.at(candidates, jnp.int32(k)), ROBOT, dt=DT, num_steps=STEPS)
+        path = path_of(candidates, jnp.int32(k))
         begin = f32([[candidates.motion.x[k], candidates.motion.y[k]]])
         want = float(exposure_integral(risk, jnp.concatenate([begin, path]), far.decay, dt=DT))
         assert float(got.exposure[k]) == pytest.approx(want, rel=0.03) and want > 0.1
@@ -236,13 +237,13 @@ def test_the_number_of_threads_changes_nothing(workers):
 def test_the_step_leads_to_the_end():
     field, candidates = world(12), population(12)
     got, alone = run(field, candidates), score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
-    free = 0
+    alone, free = jax.device_get(alone), 0
     for k in range(NUM):
         if float(got.score[k]) == BLOCKED:
             assert int(alone.step[k]) == 0
             continue
         free += 1
-        path = scoring.path_of(scoring.at(candidates, jnp.int32(k)), ROBOT, dt=DT, num_steps=STEPS)
+        path = path_of(candidates, jnp.int32(k))
         np.testing.assert_allclose(path[int(alone.step[k]) - 1], [got.x[k], got.y[k]], atol=1e-5)
     assert 0.2 * NUM < free < NUM
 
