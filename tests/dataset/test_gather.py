@@ -1,13 +1,16 @@
 """A whole small shard, from worlds to labels, and what must hold between its fields."""
 
-import functools
+import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 from scipy import ndimage
 
 from drnav_jax import dataset, worlds
-from drnav_jax.dataset import gather, shards
+from drnav_jax.dataset import collect, gather, shards
 from drnav_jax.dataset.frames import STRATUM_BITS, Frame, FrameSpec, dtypes
 from drnav_jax.dataset.shards import DatasetSpec
 from drnav_jax.models import bev
@@ -16,17 +19,12 @@ from drnav_jax.types import FRONT_LEFT_RIGHT, BevSpec, RigSpec
 from drnav_jax.worlds.frames import NEVER, NOW
 
 SPEC = FrameSpec(rig=RigSpec(FRONT_LEFT_RIGHT[:2], (12, 16)), lidar=LidarSpec(4, 180), bev=BevSpec((24, 32)))
-DATA = DatasetSpec(100, "train", 0, ("u", "t"), ticks=5, num_worlds=8, per_world=6)
-
-
-@functools.cache
-def shard(number):
-    return gather.shard(DATA, SPEC, number)
+DATA = DatasetSpec(48, "train", 0, ("u", "t"), ticks=5, num_worlds=8, per_world=6)
 
 
 @pytest.fixture(scope="module")
 def frames():
-    fields = shards.checked(shard(0), DATA.shard_size)
+    fields = shards.checked(gather.shard(DATA, SPEC, 0), DATA.shard_size)
     return Frame(**fields)
 
 
@@ -40,11 +38,29 @@ def test_fields_have_the_shapes_and_types_of_storage(frames):
     assert 20 < frames.images.mean() < 235 and frames.images.std() > 10
 
 
-def test_a_shard_is_its_number(frames):
-    again = gather.shard(DATA, SPEC, 0)
-    for name, value in shards.checked(again, DATA.shard_size).items():
-        np.testing.assert_array_equal(value, getattr(frames, name))
-    assert not set(shard(1).seed) & set(frames.seed)
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A dataset of one shard that is not whole, and its manifest."""
+    folder = tmp_path_factory.mktemp("frames")
+    return folder, dataset.write(folder, dataclasses.replace(DATA, num_frames=44), SPEC, workers=1)
+
+
+def test_a_shard_is_its_number(frames, written):
+    again = safetensors.numpy.load_file(written[0] / "shard-00000.safetensors")
+    for name, value in again.items():
+        np.testing.assert_array_equal(value, getattr(frames, name)[:44])
+    mine, next_ones = ({seed for _, seed, _ in shards.pairs(DATA, number)} for number in (0, 1))
+    assert set(frames.seed.tolist()) == mine and not mine & next_ones
+
+
+def test_what_is_sensed_is_traced_without_promotion():
+    """Shards are made in threads, where strictness does not reach."""
+    world = worlds.sample("u", 0, "train").world
+    sensors = gather._sensors(SPEC, np.random.default_rng(0))
+    seen = jax.eval_shape(
+        lambda poses, key: collect.sense(SPEC, 5, world, sensors, poses, key), jnp.zeros((15, 3)), jax.random.key(0)
+    )
+    assert seen["images"].shape == (3, 2, 12, 16, 3) and seen["local_map"].shape == (3, 24, 32)
 
 
 def test_worlds_come_as_twins_and_every_behaviour_drives(frames):
@@ -106,11 +122,11 @@ def test_the_job_names_what_is_wrong(tmp_path):
     assert held == set(worlds.HELD_OUT) and len(held) >= 2
 
 
-def test_the_job_writes_a_dataset_and_its_page(tmp_path):
-    manifest = dataset.write(tmp_path, DATA, SPEC, workers=1)
-    assert manifest["frames"] == 100 and [row["frames"] for row in manifest["shards"]] == [48, 48, 4]
+def test_the_job_writes_a_dataset_and_its_page(written):
+    folder, manifest = written
+    assert manifest["frames"] == 44 and [row["frames"] for row in manifest["shards"]] == [44]
     found = dataset.outline(manifest)
-    assert sum(found["families"].values()) == 100 and 0 < found["shares"]["dead_end_cells"] < 0.5
+    assert sum(found["families"].values()) == 44 and 0 < found["shares"]["dead_end_cells"] < 0.5
     assert "dead end cells" in dataset.table(manifest)
-    file = dataset.page(tmp_path)
+    file = dataset.page(folder)
     assert file is not None and file.stat().st_size > 20_000

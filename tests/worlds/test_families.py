@@ -26,7 +26,7 @@ SINGLE = [name for name in CLOSED if name not in MANY]  # the others have tests 
 
 
 def seeds(*families):
-    splits = (("test", 2), ("train", 1), ("val", 1))
+    splits = (("test", 2), ("train", 1))
     each = [(f, s, k) for f in families for s, n in splits for k in range(n) if s == "test" or FAMILIES[f] not in HELD_OUT]
     return [one for one in each if FAMILIES[one[0]] not in MANY]
 

@@ -15,7 +15,7 @@ def test_the_trip_can_be_driven_and_space_is_open(family, split, seed):
     check_trip_and_truth(sample(family, seed, split), BOXES)
 
 
-@pytest.mark.parametrize(("split", "seed"), SEEDS[::2])
+@pytest.mark.parametrize(("split", "seed"), SEEDS[::4])
 def test_twins_differ_in_ways_through(split, seed):
     closed, opened = sample("office", seed, split), sample("office-open", seed, split)
     check_twins(closed, opened)
