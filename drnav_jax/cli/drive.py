@@ -115,6 +115,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
     setup, evaluation = setups[first], finished.evaluations[first]
     spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates, setup.weights)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
+    params = evaluate.episode_params(trips, setup)  # of all, so that worlds have the shapes that were compiled for
     for number, k in enumerate(evaluation.kept[:PICTURES], 1):
         trip = trips[k]
         assert trip.scene.start is not None
@@ -123,8 +124,8 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
             if k in e.kept:
                 path = evaluate.path_driven(e.result, k, trip.scene.start)
                 drives[name] = report.Drive(path, e.records[e.kept.index(k)])
-        batch = jax.tree.map(lambda a: a[0], evaluate.episode_params([trip], setup))
-        states = episode.replay(evaluate.equipped(SPEC, setup), evaluate.policy_of(spec), batch, keys[k])
+        one = jax.tree.map(lambda a, k=k: a[k], params)
+        states = episode.replay(evaluate.equipped(SPEC, setup), evaluate.policy_of(spec), one, keys[k])
         path = drives[first].path
         every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
         believed = report.believe(states, spec.filter, path, SPEC.dt, every)

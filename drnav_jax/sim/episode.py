@@ -270,19 +270,22 @@ def run(
         raise ValueError("cameras need EpisodeParams.camera (CameraParams).")
     count = keys.shape[0]
     shards = [np.arange(k, count, workers) for k in range(min(workers, count))]
-    done, stop = [0] * len(shards), threading.Event()
+    done, stop, compiling = [0] * len(shards), threading.Event(), threading.Lock()
 
     def work(which: int) -> tuple[EpisodeState, Log]:
         index = shards[which]
         mine = jax.tree.map(lambda a: jnp.asarray(a)[index], (params, keys))
-        state = _start_batch(spec, policy, *mine)
+        with compiling:  # one after the other, or each thread would compile the same programs
+            state, log = _chunk_batch(spec, policy, mine[0], _start_batch(spec, policy, *mine))
         logs = []
-        while not logs or (bool(jnp.any(state.active)) and not stop.is_set()):
-            state, log = _chunk_batch(spec, policy, mine[0], state)
+        while True:
             logs.append(jax.device_get(log))
             done[which] = int(np.sum(~np.asarray(state.active)))
             if progress is not None:
                 progress(sum(done))
+            if stop.is_set() or not bool(jnp.any(state.active)):
+                break
+            state, log = _chunk_batch(spec, policy, mine[0], state)
         state = state._replace(policy=None, key=jax.random.key_data(state.key))
         return jax.device_get(state), jax.tree.map(lambda *a: np.concatenate(a, axis=1), *logs)
 
