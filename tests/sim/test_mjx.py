@@ -225,38 +225,38 @@ def test_a_wall_stops_it():
     assert back[-1, 0] < FACE - RADIUS - 0.1 and not bodies[-1].contact, "and lets it go again"
 
 
-@pytest.fixture(scope="module")
-def crowd():
-    """256 worlds of 100 obstacles and a free pose in each."""
+def crowd(num):
+    """Worlds of 100 obstacles and a free pose in each."""
     rng = np.random.default_rng(0)
     every, poses = [], []
-    for seed in range(256):
+    for seed in range(num):
         world = jax.tree.map(np.asarray, random_obstacles(seed, 100, extent=8.0))
         places = rng.uniform(-7, 7, (400, 2))
         xy = places[signed_distance(world, places) > RADIUS + 0.05][0]
         every.append(world)
         poses.append([*xy, rng.uniform(-np.pi, np.pi)])
-    return every, rows_of(*every), jnp.asarray(poses, jnp.float32), jax.vmap(lambda _: mjx.init())(jnp.arange(256))
+    return every, rows_of(*every), jnp.asarray(poses, jnp.float32), jax.vmap(lambda _: mjx.init())(jnp.arange(num))
 
 
 TICKS = 100
 
 
-def test_contact_stops_it_in_random_worlds(crowd):
-    every, solids, poses, bodies = crowd
+@pytest.mark.parametrize("num", [64, pytest.param(256, marks=pytest.mark.slow)])
+def test_contact_stops_it_in_random_worlds(num):
+    every, solids, poses, bodies = crowd(num)
     (path, log), _ = drive_many(solids, poses, bodies, jax.random.key(0), TICKS)
     path, touched = np.asarray(path), np.asarray(log.contact)
     room = np.array([signed_distance(w, p[:, :2]).min() for w, p in zip(every, path, strict=True)]) - RADIUS
     assert room.min() > -ENTERED and np.asarray(log.depth).max() < ENTERED
-    assert touched.any(axis=1).sum() > 200, "nearly all of them hit something"
+    assert touched.any(axis=1).sum() > 0.78 * num, "nearly all of them hit something"
     assert np.asarray(log.sound).all()
     apart_from_all = np.array([signed_distance(w, p[:, :2]) for w, p in zip(every, path, strict=True)]) > RADIUS + 0.1
     assert not (touched & apart_from_all).any(), "and nothing where there is nothing (0.1 m: moved within the tick)"
 
 
 @pytest.mark.slow
-def test_never_a_state_that_is_not_finite_in_a_million_steps(crowd):
-    _, solids, poses, bodies = crowd
+def test_never_a_state_that_is_not_finite_in_a_million_steps():
+    _, solids, poses, bodies = crowd(256)
     inside = solids.boxes[:, 0, :2]  # half of them begin in the middle of a box
     poses = poses.at[::2, :2].set(inside[::2])
     steps = 0
@@ -409,7 +409,7 @@ def test_vmap_is_a_loop_and_a_sweep_compiles_once():
             one = (poses[k], None, mjx.init())
             for _ in range(5):
                 mine = jax.tree.map(lambda a, k=k: a[k], solids)
-                one = mjx.step(SPEC, params, robot, mine, one[0], one[2], command, DT)
+                one = mjx.step(SPEC, params, robot, mine, one[0], one[2], command, DT, f32(NONE))
             chex.assert_trees_all_close(jax.tree.map(lambda a, k=k: a[k], got), one, atol=1e-5)
 
 
