@@ -89,7 +89,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)
     camera = camera_against_mujoco(repeats=3 if quick else 20)
     physics = physics_rates(8, 20, 2, 2) if quick else physics_rates()
-    per_second, episodes = episode_rate(2, 50) if quick else episode_rate()
+    per_second, episodes = episode_rate(2, 10, spec=EpisodeSpec(chunk_ticks=10)) if quick else episode_rate()
     planning = parts(drive, quick=quick)
     return {
         "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error,

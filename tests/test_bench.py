@@ -65,7 +65,7 @@ def test_a_serpentine_has_one_long_way():
 
 
 def test_nobody_arrives_before_the_time_is_up(result):
-    assert result["episodes"]["steps"] == 50 * result["episodes"]["batch"]
+    assert result["episodes"]["steps"] == 10 * result["episodes"]["batch"]
 
 
 def test_packed_words_score_almost_like_float_layers(result):
