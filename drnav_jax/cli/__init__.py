@@ -1,14 +1,9 @@
 """The command line `drnav`. Thin: it reads flags, calls jobs, writes files."""
 
-import contextlib
-import os
 import sys
-from pathlib import Path
-
-import jax
 
 from drnav_jax import __version__, bench, report
-from drnav_jax.cli import data, drive, learn
+from drnav_jax.cli import data, drive, learn, process
 from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Train, Trial, Worlds, parse
 from drnav_jax.cli.terminal import INTERRUPTED, stdout_kept
 
@@ -36,19 +31,6 @@ def _perform(args: Command) -> int:
             return _measure(args)
 
 
-def _cache_programs() -> None:
-    """Keep compiled programs for the next command, unless somebody has already said where."""
-    if jax.config.values["jax_compilation_cache_dir"] is not None:
-        return
-    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(root) / "drnav_jax"
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        jax.config.update("jax_compilation_cache_dir", str(folder))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
 def main(argv: list[str] | None = None) -> int:
     """The console script; returns the exit code (0; 2 = the user's mistake; 130 = interrupted)."""
     argv = sys.argv[1:] if argv is None else argv
@@ -57,7 +39,8 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     try:
         args = parse(argv)
-        _cache_programs()
+        process.cache_programs()
+        process.keep_memory()
         return _perform(args)
     except SystemExit:
         return 0

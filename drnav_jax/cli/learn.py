@@ -1,22 +1,14 @@
 """`drnav train`: data sets in, weights out."""
 
-import os
 import sys
 
-import jax
-
 from drnav_jax import dataset, report, train
+from drnav_jax.cli import process
 from drnav_jax.cli.flags import Train
 from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
 from drnav_jax.models.batch import Batch, batch_of
 
 CHUNK = 64  # validation frames at a time
-
-
-def _devices() -> None:
-    """Without an accelerator each core is a device of its own: parts of a batch then never wait for each other."""
-    if jax.config.values["jax_platforms"] in ("cpu", None) and jax.config.values["jax_num_cpu_devices"] < 1:
-        jax.config.update("jax_num_cpu_devices", os.cpu_count() or 1)
 
 
 def _validation(args: Train) -> list[Batch]:
@@ -37,7 +29,7 @@ def perform(args: Train) -> int:
     if args.stream == (args.data is not None):
         raise ValueError("give either --data DIR or --stream.")
     spec = train.read(args.config)
-    _devices()
+    process.use_every_core()
     if args.data is not None:
         folder = args.data
         source = lambda first: dataset.batches(folder, spec.batch_size, spec.seed, first=first)  # noqa: E731
