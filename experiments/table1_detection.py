@@ -7,7 +7,9 @@ networks that lack a sensor or a part, by the geometric rule, by CLIP and by a v
 BLOCKED for front, left and right; cells carry a probability of being a dead end. Intervals are bootstrapped over worlds.
 
 Rows `image_only`, `lidar_only`, `no_attention`, `no_lift` and `tokens` are networks of their own, trained with
-`drnav train --config experiments/ablations/ROW.yaml` and read from `--ablations`/ROW.safetensors.
+`drnav train --config experiments/ablations/ROW.yaml` and read from `--ablations`/ROW.safetensors. `clip` needs open_clip
+and its weights on this machine, `vlm` an OpenAI-compatible endpoint (`--vlm-url`): `http://localhost:8000/v1` is a server
+here, the paper's GPT and Gemini rows are `https://api.openai.com/v1` and Google's address in `models.vlm`.
 """
 
 import dataclasses
@@ -21,9 +23,9 @@ import jax
 import numpy as np
 import tyro
 
-from drnav_jax import dataset, report, worlds
-from drnav_jax.models import network, weights
-from drnav_jax.models.batch import Batch, batch_of
+from drnav_jax import dataset, report, viz, worlds
+from drnav_jax.models import clip, network, views, vlm, weights
+from drnav_jax.models.batch import NOW, Batch, batch_of
 from drnav_jax.train import validate
 from drnav_jax.train.validate import Predictions
 from drnav_jax.types import BevSpec, RigSpec
@@ -32,6 +34,7 @@ COLUMNS = (
     "accuracy", "accuracy_stable", "balanced_accuracy", "dead_end_f1", "cell_auroc", "cell_auroc_unseen", "cell_ap",
     "interior_auroc", "ece", "latency_ms", "throughput_hz", "parameters",
 )  # fmt: skip
+MORE = ("ece_path", "cell_auroc_everywhere", "frames", "note")
 ABLATIONS = ("image_only", "lidar_only", "no_attention", "no_lift", "tokens")
 CHUNK = 60  # frames per call; shards hold 480
 REPEATS = 50  # of the timed call
@@ -49,6 +52,13 @@ class Config:
         weights: Of the fusion network; None = those that come with the package.
         ablations: Folder of the other networks' weights.
         out: Folder for frames, table and picture.
+        clip_model: Name in open_clip.
+        clip_weights: A file of weights, or a tag of open_clip whose file is in its cache.
+        vlm_url: Endpoint of the vision-language model; empty = it is not asked.
+        vlm_model: Its name there.
+        vlm_key: Environment variable that holds the key; empty = none is needed.
+        vlm_frames: So many frames, evenly spread, are put to it.
+        pictured: Frames in the picture.
         json: Print one JSON object on stdout, and nothing else there.
     """
 
@@ -58,12 +68,21 @@ class Config:
     weights: Path | None = None
     ablations: Path = HERE / "ablations"
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("results") / "table1"
+    clip_model: str = clip.ClipSpec.model
+    clip_weights: str = clip.ClipSpec.weights
+    vlm_url: str = ""
+    vlm_model: str = vlm.VlmSpec.model
+    vlm_key: str = vlm.VlmSpec.key_variable
+    vlm_frames: int = 120
+    pictured: int = 8
     json: bool = False
 
     def __post_init__(self) -> None:
-        """Check the number of frames."""
+        """Check numbers of frames."""
         if self.frames < CHUNK or self.frames % CHUNK:
             raise ValueError(f"--frames must be a multiple of {CHUNK}, got {self.frames}.")
+        if not (1 <= self.vlm_frames and 1 <= self.pictured):
+            raise ValueError("--vlm-frames and --pictured must be >= 1.")
 
 
 def gathered(config: Config) -> tuple[list[Batch], tuple[str, ...]]:
@@ -95,7 +114,7 @@ def latency(trained: weights.Trained, num_points: int) -> float:
 def row(found: Predictions, extra: dict[str, Any]) -> dict[str, Any]:
     """One row of the table, with intervals."""
     values = validate.figures(found) | extra
-    return {name: _number(values.get(name)) for name in (*COLUMNS, "ece_path") if name in values} | {
+    return {name: _number(values[name]) for name in (*COLUMNS, *MORE) if name in values} | {
         "intervals": {name: [_number(a), _number(b)] for name, (a, b) in validate.intervals(found).items()}
     }
 
@@ -113,6 +132,45 @@ def of_network(file: Path, batches: list[Batch]) -> tuple[Predictions, dict[str,
     found = validate.predict(trained.spec, trained.params, batches, trained.calibration)
     ms = latency(trained, batches[0].inputs.points.shape[1])
     return found, {"latency_ms": ms, "throughput_hz": 1e3 / ms, "parameters": network.count(trained.params)}
+
+
+def _of_images(judged: views.Judgement | vlm.Answer, targets: Any) -> Predictions:
+    return Predictions(np.asarray(judged.path), np.asarray(judged.dead_end), None, targets)
+
+
+def of_clip(config: Config, batches: list[Batch]) -> tuple[Predictions, dict[str, Any]] | str:
+    """What CLIP says; or why it says nothing."""
+    spec = clip.ClipSpec(model=config.clip_model, weights=config.clip_weights)
+    try:
+        encode = clip.load(spec)
+    except ValueError as error:
+        return str(error)
+    towards, parts, begun = clip.prompt_weights(spec, encode), [], time.perf_counter()
+    for batch in batches:
+        x = batch.inputs
+        judged = clip.judge(encode, towards, np.asarray(x.images), x.rig, np.asarray(x.image_valid))
+        parts.append(_of_images(judged, jax.tree.map(np.asarray, batch.targets)))
+    ms = 1e3 * (time.perf_counter() - begun) / (CHUNK * len(batches))
+    return validate.joined(parts), {"latency_ms": ms, "throughput_hz": 1e3 / ms}
+
+
+def of_vlm(config: Config, batches: list[Batch]) -> tuple[Predictions, dict[str, Any]] | str:
+    """What a vision-language model says of some of the frames; or why it says nothing."""
+    if not config.vlm_url:
+        return "not asked: give --vlm-url"
+    spec = vlm.VlmSpec(base_url=config.vlm_url, model=config.vlm_model, key_variable=config.vlm_key)
+    every = jax.tree.map(lambda *a: np.concatenate([np.asarray(part) for part in a]), *batches)
+    index = np.unique(np.linspace(0, config.frames - 1, config.vlm_frames).astype(int))
+    x, targets = jax.tree.map(lambda a: a[index], (every.inputs, every.targets))
+    answer = vlm.ask_all(spec, x.images, x.rig, x.image_valid)
+    silent = sorted({problem for problem in answer.problem if problem})
+    if all(answer.problem):
+        return f"no answers: {silent[0]}"
+    ms = 1e3 * float(np.nanmedian(answer.seconds))
+    extra: dict[str, Any] = {"latency_ms": ms, "throughput_hz": 1e3 / ms, "frames": len(index)}
+    if silent:
+        extra["note"] = f"{sum(map(bool, answer.problem))} of {len(index)} frames without an answer, such as: {silent[0]}"
+    return _of_images(answer, targets), extra
 
 
 def by_family(found: Predictions, families: tuple[str, ...], wanted: tuple[str, ...]) -> dict[str, Any]:
@@ -137,6 +195,29 @@ def by_stratum(found: Predictions) -> dict[str, Any]:
     return out
 
 
+def pictured(
+    config: Config, found: Predictions, batches: list[Batch], families: tuple[str, ...]
+) -> list[dict[str, Any]]:
+    """Rows for a picture like the paper's Fig. 3: frames with dead ends in view, of as many families as there are."""
+    t = found.targets
+    in_view = (t.dead_end & t.valid & (t.visibility == NOW)).sum(axis=(1, 2)) >= 60  # cells: 2.4 m^2
+    order = np.random.default_rng(config.seed).permutation(np.flatnonzero(in_view))
+    turn = [int(np.sum(t.family[order[:k]] == t.family[n])) for k, n in enumerate(order)]  # its family's how-many-th
+    chosen = order[np.argsort(turn, kind="stable")][: config.pictured]
+    assert found.dead is not None
+    rows = []
+    for k in sorted(chosen, key=lambda k: t.family[k]):
+        batch, at = batches[k // CHUNK], k % CHUNK
+        fields = ("dead_end", "valid", "visibility", "inside", "interior", "path")
+        ended = "closed" if t.closed[k] else "open"
+        rows.append({name: np.asarray(getattr(t, name))[k] for name in fields} | {
+            "title": f"{families[t.family[k]]}:{t.seed[k]} ({ended})", "images": np.asarray(batch.inputs.images)[at],
+            "local_map": np.asarray(batch.inputs.local_map)[at], "p_dead": found.dead[k] / 65535,
+            "p_open": found.path[k], "p_flag": found.flag[k],
+        })  # fmt: skip
+    return rows
+
+
 def main(config: Config) -> dict[str, Any]:
     """Judge and write the table."""
     config.out.mkdir(parents=True, exist_ok=True)
@@ -152,6 +233,9 @@ def main(config: Config) -> dict[str, Any]:
         rows[name], strata[name] = row(*said), by_stratum(said[0])
         per_family[name] = by_family(said[0], families, families)
         ours = said[0] if name == "drnav" else ours
+    for name, judge in (("clip", of_clip), ("vlm", of_vlm)):
+        said = judge(config, batches)
+        rows[name] = {"note": said} if isinstance(said, str) else row(*said)
     begun = time.perf_counter()
     rule = validate.by_rule(batches, BevSpec(), 0.25)
     ms = 1e3 * (time.perf_counter() - begun) / len(rule.path)
@@ -167,8 +251,12 @@ def main(config: Config) -> dict[str, Any]:
         "experiment": "table1_detection", "split": config.split, "seed": config.seed, "frames": config.frames,
         "rows": rows, "strata": strata, "families": pick(known), "unseen_families": pick(held),
     }  # fmt: skip
-    (config.out / f"table1-{config.split}-{config.seed}.json").write_text(report.dumps(result) + "\n")
-    if ours is None:
+    named = f"table1-{config.split}-{config.seed}"
+    (config.out / f"{named}.json").write_text(report.dumps(result) + "\n")
+    if ours is not None:
+        file = viz.samples(config.out / f"{named}.png", pictured(config, ours, batches, families))
+        print(f"table1: wrote {file}", file=sys.stderr)
+    else:
         print("table1: there are no weights of the fusion network; train some with `drnav train`.", file=sys.stderr)
     return result
 

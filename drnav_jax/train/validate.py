@@ -23,7 +23,7 @@ from drnav_jax.worlds.labels import clearance_of
 from drnav_jax.worlds.openings import Floor, openings
 
 RAW = Calibration()
-NEAR_SEEN = 2.0  # [m] never-seen cells count this close to seen ones; what lies farther off nobody can know
+NEAR_SEEN = 2.0  # [m] never-seen cells count this close to seen ones; farther off there is no evidence, and none is used
 
 
 class Predictions(NamedTuple):
@@ -62,6 +62,11 @@ def predict(
         targets.append(jax.tree.map(np.asarray, batch.targets))
     path, flag, dead = (np.concatenate(p) for p in zip(*parts, strict=True))
     return Predictions(path, flag, dead, jax.tree.map(lambda *a: np.concatenate(a), *targets))
+
+
+def joined(parts: list[Predictions]) -> Predictions:
+    """One after the other."""
+    return jax.tree.map(lambda *a: np.concatenate(a), *parts)
 
 
 def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Predictions:
@@ -123,6 +128,9 @@ def _of_ways(found: Predictions) -> dict[str, float]:
 def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
     """Accuracy of ways, F1 of the flag, AUROC and AP of cells, interior AUROC, calibration errors; nan = undefined.
 
+    Cells are judged where there is evidence: seen ones, and never-seen ones within `NEAR_SEEN` of them (alone in
+    `cell_auroc_unseen`); `cell_auroc_everywhere` is over all that a label is defined for.
+
     Args:
         found: From `predict` or `by_rule`.
         resolution: Of the grid [m].
@@ -130,16 +138,19 @@ def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
     t = found.targets
     out = _of_ways(found)
     if found.dead is None:
-        names = ("cell_auroc", "cell_auroc_unseen", "cell_ap", "interior_auroc", "ece")
+        names = ("cell_auroc", "cell_auroc_unseen", "cell_auroc_everywhere", "cell_ap", "interior_auroc", "ece")
         return out | dict.fromkeys(names, float("nan"))
     dead = found.dead.astype(np.float32) / 65535
-    inner, unseen = t.interior & t.valid, near_seen(t.visibility, resolution) & t.valid
+    unseen = near_seen(t.visibility, resolution) & t.valid
+    judged = unseen | (t.valid & (t.visibility != NEVER))
+    inner = judged & t.interior
     return out | {
-        "cell_auroc": metrics.auroc(dead[t.valid], t.dead_end[t.valid]),
+        "cell_auroc": metrics.auroc(dead[judged], t.dead_end[judged]),
         "cell_auroc_unseen": metrics.auroc(dead[unseen], t.dead_end[unseen]),
-        "cell_ap": metrics.average_precision(dead[t.valid], t.dead_end[t.valid]),
+        "cell_auroc_everywhere": metrics.auroc(dead[t.valid], t.dead_end[t.valid]),
+        "cell_ap": metrics.average_precision(dead[judged], t.dead_end[judged]),
         "interior_auroc": metrics.auroc(dead[inner], t.dead_end[inner]),
-        "ece": metrics.calibration_error(dead[t.valid], t.dead_end[t.valid]),
+        "ece": metrics.calibration_error(dead[judged], t.dead_end[judged]),
         "ece_path": metrics.calibration_error(found.path, t.path),
     }
 
@@ -152,7 +163,7 @@ def worlds_of(targets: Targets) -> np.ndarray:
 
 def intervals(
     found: Predictions, names: tuple[str, ...] = ("accuracy", "accuracy_stable", "dead_end_f1", "interior_auroc"),
-    *, seed: int = 0, resamples: int = 200, level: float = 0.95, bins: int = 512,
+    *, seed: int = 0, resamples: int = 200, level: float = 0.95, bins: int = 512, resolution: float = 0.2,
 ) -> dict[str, tuple[float, float]]:  # fmt: skip
     """Bootstrap intervals over worlds, since frames of one world are much alike.
 
@@ -163,6 +174,7 @@ def intervals(
         resamples: Number of bootstrap samples.
         level: Of the intervals.
         bins: Steps of probability that AUROC tells apart.
+        resolution: Of the grid [m].
     """
     t, world = found.targets, worlds_of(found.targets)
     count = int(world.max()) + 1
@@ -170,7 +182,8 @@ def intervals(
     cells = {}
     if found.dead is not None:
         step = (found.dead.astype(np.int64) * bins) >> 16
-        for name, mask in (("interior_auroc", t.interior & t.valid), ("cell_auroc", t.valid)):
+        judged = t.valid & ((t.visibility != NEVER) | near_seen(t.visibility, resolution))
+        for name, mask in (("interior_auroc", t.interior & judged), ("cell_auroc", judged)):
             code = step + bins * t.dead_end
             cells[name] = np.stack([np.bincount(code[f][mask[f]], minlength=2 * bins) for f in frames])
     rng, drawn = np.random.default_rng(seed), {name: [] for name in names}

@@ -19,6 +19,7 @@ HATCHES: dict[str, tuple[str, str]] = {
     "STRIPE": ("#b8860b", "||"), "METAL": ("#37474f", ""), "CAR": ("#5d4037", ""),
 }  # fmt: skip
 LIDAR = "#d6249f"
+KNOWN = ((0.62, 0.64, 0.68), (1.0, 1.0, 1.0), (0.17, 0.18, 0.2))  # of cells that are unknown, free, occupied
 DEPTHS = "YlOrRd"
 
 
@@ -186,19 +187,21 @@ def gallery(file: str | Path, rows: Sequence[Sequence[tuple[TopView, np.ndarray]
 
 
 def samples(file: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """A page of training frames: cameras, known map, truth, visibility.
+    """A page of frames: cameras, known map, truth, visibility, and what was predicted.
 
     Args:
         file: PNG to write.
         rows: Frames as mappings: `title`, `images` `[N, h, w, 3]` uint8, `local_map`, `dead_end`, `valid`, `visibility`,
-            `inside` and `interior` `[h, w]` (`dataset.frames`), `path` `[3]`.
+            `inside` and `interior` `[h, w]` (`dataset.frames`), `path` `[3]`; and, if all have a prediction, `p_dead`
+            `[h, w]`, `p_open` `[3]` and `p_flag`.
 
     Raises:
         MissingExtra: If matplotlib is not installed.
     """
-    cameras = max(len(row["images"]) for row in rows)
-    figure, _ = _figure(1.7 * (cameras + 3), 1.95 * len(rows))
-    grid = figure.add_gridspec(len(rows), cameras + 3, wspace=0.04, hspace=0.22)
+    cameras, predicted = max(len(row["images"]) for row in rows), all("p_dead" in row for row in rows)
+    columns = cameras + 3 + predicted
+    figure, _ = _figure(1.7 * columns, 1.95 * len(rows))
+    grid = figure.add_gridspec(len(rows), columns, wspace=0.04, hspace=0.22)
     for i, row in enumerate(rows):
         for k, image in enumerate(row["images"]):
             axes = figure.add_subplot(grid[i, k])
@@ -206,20 +209,30 @@ def samples(file: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             axes.set_axis_off()
             if k == 0:
                 axes.set_title(row["title"], fontsize=6, loc="left")
-        valid = np.asarray(row["valid"], bool)
-        known = np.array([[0.62, 0.64, 0.68], [1, 1, 1], [0.17, 0.18, 0.2]])[np.asarray(row["local_map"])]
-        truth = np.where(valid[..., None], np.array([0.82, 0.95, 0.84]), np.array([0.2, 0.2, 0.22]))
-        truth[~np.asarray(row["inside"], bool)] = (0.62, 0.64, 0.68)
-        truth[valid & np.asarray(row["dead_end"], bool)] = (0.85, 0.25, 0.2)
-        truth[valid & np.asarray(row["interior"], bool)] *= 0.72
-        seen = np.array([[0.2, 0.55, 0.9], [0.65, 0.8, 0.95], [0.25, 0.25, 0.28]])[np.asarray(row["visibility"])]
-        is_open = "".join(mark if ok else "-" for mark, ok in zip("FLR", row["path"], strict=True))
-        for k, (name, picture) in enumerate(((f"map, open: {is_open}", known), ("truth", truth), ("seen", seen))):
+        for k, (name, picture) in enumerate(_grids(row, predicted)):
             axes = figure.add_subplot(grid[i, cameras + k])
             axes.imshow(np.rot90(picture)[:, ::-1], interpolation="nearest")  # forward is up, left is left
             axes.set_title(name, fontsize=6)
             axes.set_axis_off()
     return _save(figure, Path(file))
+
+
+def _grids(row: Mapping[str, Any], predicted: bool) -> list[tuple[str, np.ndarray]]:
+    """Titles and colours `[h, w, 3]` of a frame's grids."""
+    valid = np.asarray(row["valid"], bool)
+    known = np.array(KNOWN)[np.asarray(row["local_map"])]
+    truth = np.where(valid[..., None], np.array([0.82, 0.95, 0.84]), np.array([0.2, 0.2, 0.22]))
+    truth[~np.asarray(row["inside"], bool)] = (0.62, 0.64, 0.68)
+    truth[valid & np.asarray(row["dead_end"], bool)] = (0.85, 0.25, 0.2)
+    truth[valid & np.asarray(row["interior"], bool)] *= 0.72
+    seen = np.array([[0.2, 0.55, 0.9], [0.65, 0.8, 0.95], [0.25, 0.25, 0.28]])[np.asarray(row["visibility"])]
+    marked = lambda ways: "".join(mark if ok else "-" for mark, ok in zip("FLR", ways, strict=True))  # noqa: E731
+    out = [(f"map, open: {marked(row['path'])}", known), ("truth", truth), ("seen", seen)]
+    if predicted:
+        said = look.over_white(look.heat(row["p_dead"]))
+        said[np.asarray(row["local_map"]) == len(KNOWN) - 1] = KNOWN[-1]
+        out.append((f"said: {marked(np.asarray(row['p_open']) >= 0.5)}, dead end {row['p_flag']:.2f}", said))
+    return out
 
 
 def _save(figure: Any, file: Path) -> Path:
