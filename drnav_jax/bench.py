@@ -1,8 +1,8 @@
 """Times of the parts next to their rivals, measured in turn within one run.
 
-What is timed: the planner on a recorded drive (`bench_planning`), the LiDAR and the cameras against native MuJoCo
-(`bench_sensors`), the physics (`bench_physics`), and batched closed-loop episodes. A fixed matmul from the same run
-tells a slow hour from slow code.
+What is timed: the planner on a recorded drive (`bench_planning`), the fusion network alone and in the tick
+(`bench_network`), the LiDAR and the cameras against native MuJoCo (`bench_sensors`), the physics (`bench_physics`), and
+batched closed-loop episodes. A fixed matmul from the same run tells a slow hour from slow code.
 """
 
 import os
@@ -16,6 +16,7 @@ import jax
 import numpy as np
 
 from drnav_jax import evaluate, worlds
+from drnav_jax.bench_network import network_times
 from drnav_jax.bench_physics import physics_rates
 from drnav_jax.bench_planning import NUM_STEPS, STRIDE, parts, record, scoring_times, tick_times
 from drnav_jax.bench_sensors import camera_against_mujoco, lidar_against_mujoco
@@ -46,7 +47,7 @@ def episode_rate(
     """
     scenes = [worlds.sample(FAMILIES[k % len(FAMILIES)], k // len(FAMILIES)) for k in range(batch)]
     setup = Setup(max_speed=PACE, time_limit=num_steps * spec.dt)
-    policy = evaluate.policy_of(evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates))
+    policy = evaluate.policy_of(setup.nav)
     params = evaluate.episode_params(evaluate.prepare(scenes, setup), setup)
     keys = jax.random.split(jax.random.key(0), batch)
     short = params._replace(time_limit=np.full_like(params.time_limit, spec.dt))
@@ -79,12 +80,14 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         quick: Few repeats and short episodes: the same keys in less time, figures that mean little.
 
     Returns:
-        `tick_lidar_ms`, `scoring` (candidate-steps per second by number of candidates), `scoring_error`, `plan_ms` (goal
-        generator with 4,096 candidates and DWA), `cost_to_go_ms` (256x256), `planning` (`bench_planning.parts`), `lidar`,
-        `camera`, `mjx`, `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
+        `tick_lidar_ms`, `network_ms`, `network` and `tick_fusion_ms` (`bench_network`), `scoring` (candidate-steps per
+        second by number of candidates), `scoring_error`, `plan_ms` (goal generator with 4,096 candidates and DWA),
+        `cost_to_go_ms` (256x256), `planning` (`bench_planning.parts`), `lidar`, `camera`, `mjx`, `episodes_per_s`,
+        `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
     drive = record(2 * STRIDE if quick else warm_up + 200)
+    seeing = network_times(drive, warm_up, 3 if quick else 100)
     rates, error, reference = scoring_times(drive, 3 if quick else 50)
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)
     camera = camera_against_mujoco(repeats=3 if quick else 20)
@@ -92,7 +95,8 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     per_second, episodes = episode_rate(2, 10, spec=EpisodeSpec(chunk_ticks=10)) if quick else episode_rate()
     planning = parts(drive, quick=quick)
     return {
-        "tick_lidar_ms": tick_times(drive, warm_up), "scoring": rates, "scoring_error": error,
+        "tick_lidar_ms": tick_times(drive, warm_up), "network_ms": seeing["network"]["median"],
+        "network": seeing["network"], "tick_fusion_ms": seeing["tick_fusion"], "scoring": rates, "scoring_error": error,
         "plan_ms": planning["plan"]["both"], "cost_to_go_ms": planning["cost_to_go"]["full"], "planning": planning,
         "lidar": lidar, "camera": camera, "mjx": physics, "episodes_per_s": per_second, "episodes": episodes,
         "reference_matmul_ms": reference, "machine": machine(),
@@ -105,11 +109,17 @@ def table(result: dict[str, Any]) -> str:
         result[k] for k in ("tick_lidar_ms", "scoring_error", "lidar", "camera", "mjx", "episodes")
     )
     plan, route = (result["planning"][k] for k in ("plan", "cost_to_go"))
+    sees = result["tick_fusion_ms"]
     rival = camera["no_mujoco"] or f"{camera['ratio']:.1f} x MuJoCo"
     rates = {f"scoring, {int(n):,} x {NUM_STEPS}": rate for n, rate in result["scoring"].items()}
     rows = [
         ("tick, 4,096 candidates", f"{tick['median']:.1f} ms median, {tick['p95']:.1f} p95, {tick['max']:.1f} max"),
         ("tick that replans", f"{tick['replan_median']:.1f} ms median, {tick['replan_p95']:.1f} p95"),
+        ("fusion network", f"{result['network_ms']:.1f} ms median, {result['network']['p95']:.1f} p95"),
+        (
+            "tick with it",
+            f"{sees['median']:.1f} ms median, {sees['p95']:.1f} p95; replanning {sees['replan_p95']:.1f} p95",
+        ),
         *((name, f"{rate / 1e6:.0f} M candidate-steps/s") for name, rate in rates.items()),
         (
             "  against bilinear",

@@ -51,7 +51,7 @@ def record(num_ticks: int, num_candidates: int = 4096, seed: int = 0) -> Drive:
     scene = worlds.sample(DRIVE, seed)
     assert scene.start is not None and scene.goal is not None
     setup = Setup(num_candidates=num_candidates, seed=seed)
-    spec = evaluate.spec_of(setup.planner, setup.predictor, num_candidates)
+    spec = setup.nav
     params = jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), evaluate.params_of(setup))
     lidar, beams = LidarParams(max_range=setup.lidar_range), LidarSpec()
     pose, twist = jnp.asarray(scene.start, jnp.float32), jnp.zeros(2, jnp.float32)

@@ -87,6 +87,16 @@ class Setup:
         if self.num_candidates < 320:
             raise ValueError(f"num_candidates must be >= 320, got {self.num_candidates}.")
 
+    @property
+    def evidence(self) -> str:
+        """The predictor that is asked: none by planners to which dead ends do not matter."""
+        return self.predictor if planner(self.planner).predicts else "none"
+
+    @property
+    def nav(self) -> NavSpec:
+        """The robot's spec."""
+        return spec_of(self.planner, self.evidence, self.num_candidates, self.weights)
+
 
 def equipped(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
     """The spec of episodes with the setup's cameras and physics; a fast robot is simulated in shorter time steps.
@@ -94,7 +104,7 @@ def equipped(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
     Raises:
         ValueError: If `mjx_boxes` is out of range.
     """
-    if setup.predictor == "fusion":
+    if setup.evidence == "fusion":
         spec = dataclasses.replace(spec, rig=RigSpec())
     if setup.physics == "kinematic":
         return dataclasses.replace(spec, physics=None)
@@ -202,8 +212,8 @@ def params_of(setup: Setup) -> NavParams:
         score = score._replace(horizon=setup.horizon)
     occupancy = params.filter.occupancy._replace(max_range=setup.lidar_range)
     rule = geometric.GeometricParams(radius=setup.robot_radius)
-    predictor: Any = {"geometric": rule}.get(setup.predictor)
-    if setup.predictor == "fusion":
+    predictor: Any = {"geometric": rule}.get(setup.evidence)
+    if setup.evidence == "fusion":
         predictor = fusion.params_of(trained(setup.weights), rule=rule)
     return params._replace(
         robot=robot, score=score, route=route, predictor=predictor,
@@ -227,7 +237,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
     each = [
         params._replace(goal_tolerance=t.goal_tolerance) for t in trips
     ]
-    if setup.predictor == "oracle":
+    if setup.evidence == "oracle":
         labels = _pad_maps([label_map(t, setup.robot_radius) for t in trips])
         each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
     batch = len(trips)
@@ -244,7 +254,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         robot=spread(params.robot),
         policy=_stack(each),
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
-        camera=spread(CameraParams()) if setup.predictor == "fusion" else (),
+        camera=spread(CameraParams()) if setup.evidence == "fusion" else (),
         faults=spread(episode.FaultParams()),
         motors=() if physics is None else spread(mjx.MjxParams()),
         solids=solids,
@@ -289,7 +299,7 @@ def evaluate(
     begin = time.perf_counter()
     batch = episode_params(trips, setup, params)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
-    policy = policy_of(spec_of(setup.planner, setup.predictor, setup.num_candidates, setup.weights))
+    policy = policy_of(setup.nav)
     result = episode.run(equipped(spec, setup), policy, batch, keys, progress=progress)
     kept = [k for k in range(len(trips)) if result.finished[k]]
     if not kept:

@@ -231,7 +231,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     local = belief.local_map(spec.filter, state.belief)
     nothing = jnp.zeros(grid.shape, jnp.float32)
     held, risk = state.belief, nothing
-    if planner.risk_in_route or planner.exposure:
+    if planner.predicts:
         evidence = spec.predictor(params.predictor, seen, local)
         everywhere = jnp.ones(grid.shape, bool)  # where it has nothing to say its confidence is 0
         held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)

@@ -14,6 +14,7 @@ here, the paper's GPT and Gemini rows are `https://api.openai.com/v1` and Google
 
 import dataclasses
 import math
+import re
 import sys
 import time
 from pathlib import Path
@@ -26,7 +27,8 @@ import tyro
 from drnav_jax import dataset, report, viz, worlds
 from drnav_jax.models import clip, network, views, vlm, weights
 from drnav_jax.models.batch import NOW, Batch, batch_of
-from drnav_jax.train import validate
+from drnav_jax.sim.lidar import LidarSpec
+from drnav_jax.train import faults, validate
 from drnav_jax.train.validate import Predictions
 from drnav_jax.types import BevSpec, RigSpec
 
@@ -36,7 +38,11 @@ COLUMNS = (
 )  # fmt: skip
 MORE = ("ece_path", "cell_auroc_everywhere", "frames", "note")
 ABLATIONS = ("image_only", "lidar_only", "no_attention", "no_lift", "tokens")
-CHUNK = 60  # frames per call; shards hold 480
+POORER = {  # LiDARs whose frames are gathered anew
+    "10 % of the points": dataset.FrameSpec(lost=0.9),
+    "one ring": dataset.FrameSpec(lidar=LidarSpec(rings=1, elevation_min=0.0, elevation_max=0.0)),
+}
+CHUNK = 60  # frames per call
 REPEATS = 50  # of the timed call
 HERE = Path(__file__).resolve().parent
 
@@ -58,6 +64,7 @@ class Config:
         vlm_model: Its name there.
         vlm_key: Environment variable that holds the key; empty = none is needed.
         vlm_frames: So many frames, evenly spread, are put to it.
+        loss_frames: So many are judged again with sensors that fail; 0 = none.
         pictured: Frames in the picture.
         json: Print one JSON object on stdout, and nothing else there.
     """
@@ -74,6 +81,7 @@ class Config:
     vlm_model: str = vlm.VlmSpec.model
     vlm_key: str = vlm.VlmSpec.key_variable
     vlm_frames: int = 120
+    loss_frames: int = 960
     pictured: int = 8
     json: bool = False
 
@@ -81,20 +89,24 @@ class Config:
         """Check numbers of frames."""
         if self.frames < CHUNK or self.frames % CHUNK:
             raise ValueError(f"--frames must be a multiple of {CHUNK}, got {self.frames}.")
+        if not 0 <= self.loss_frames <= self.frames or self.loss_frames % CHUNK:
+            raise ValueError(f"--loss-frames must be a multiple of {CHUNK} and <= --frames, got {self.loss_frames}.")
         if not (1 <= self.vlm_frames and 1 <= self.pictured):
             raise ValueError("--vlm-frames and --pictured must be >= 1.")
 
 
-def gathered(config: Config) -> tuple[list[Batch], tuple[str, ...]]:
-    """The frames, gathered unless they are there already, and the families' names."""
-    folder = config.out / f"frames-{config.split}-{config.seed}-{config.frames}"
-    spec = dataset.spec_of(config.frames, config.split, config.seed)
+def gathered(
+    config: Config, count: int, sensors: dataset.FrameSpec, name: str = ""
+) -> tuple[list[Batch], tuple[str, ...]]:
+    """The first frames, gathered unless they are there already, and the families' names."""
+    folder = config.out / f"frames-{config.split}-{config.seed}-{count}{name and '-'}{name}"
+    spec = dataset.spec_of(count, config.split, config.seed)
     begun = time.perf_counter()
 
     def said(done: int, _: int) -> None:
-        print(f"table1: {done}/{config.frames} frames, {time.perf_counter() - begun:.0f} s", file=sys.stderr)
+        print(f"table1: {done}/{count} frames {name}, {time.perf_counter() - begun:.0f} s", file=sys.stderr)
 
-    dataset.write(folder, spec, progress=said)
+    dataset.write(folder, spec, sensors, progress=said)
     frames = dataset.batches(folder, CHUNK, 0, epochs=1, workers=0)
     return [batch_of(frame._asdict()) for frame in frames], spec.families
 
@@ -218,10 +230,32 @@ def pictured(
     return rows
 
 
+def with_losses(config: Config, batches: list[Batch]) -> dict[str, Any]:
+    """Accuracy on the first frames when sensors fail, next to the rule and the network that knows LiDAR only."""
+    usual = batches[: config.loss_frames // CHUNK]
+    trained = weights.load(config.weights or weights.SHIPPED)
+    ask = lambda frames, change=None: validate.predict(  # noqa: E731
+        trained.spec, trained.params, frames, trained.calibration, change
+    )
+    found = {"all sensors": ask(usual)}
+    found |= {name: ask(usual, change) for name, change in faults.cases(config.seed).items()}
+    for name, sensors in POORER.items():
+        frames, _ = gathered(config, config.loss_frames, sensors, re.sub(r"\W+", "-", name))
+        found[name] = ask(frames)
+    lidar_only = of_network(config.ablations / "lidar_only.safetensors", usual)
+    if lidar_only is not None:
+        found["network without cameras"] = lidar_only[0]
+    found["geometric rule"] = validate.by_rule(usual, BevSpec(), 0.25)
+    columns = ("accuracy", "accuracy_stable", "dead_end_f1", "cell_auroc")
+    said = {name: validate.figures(values) for name, values in found.items()}
+    finite = {name: bool(np.isfinite(p.path).all() and np.isfinite(p.flag).all()) for name, p in found.items()}
+    return {name: {c: _number(v[c]) for c in columns} | {"finite": finite[name]} for name, v in said.items()}
+
+
 def main(config: Config) -> dict[str, Any]:
     """Judge and write the table."""
     config.out.mkdir(parents=True, exist_ok=True)
-    batches, families = gathered(config)
+    batches, families = gathered(config, config.frames, dataset.FrameSpec())
     files = {"drnav": config.weights or weights.SHIPPED}
     files |= {name: config.ablations / f"{name}.safetensors" for name in ABLATIONS}
     rows, strata, ours, per_family = {}, {}, None, {}
@@ -251,6 +285,8 @@ def main(config: Config) -> dict[str, Any]:
         "experiment": "table1_detection", "split": config.split, "seed": config.seed, "frames": config.frames,
         "rows": rows, "strata": strata, "families": pick(known), "unseen_families": pick(held),
     }  # fmt: skip
+    if ours is not None and config.loss_frames:
+        result["sensor_loss"] = with_losses(config, batches)
     named = f"table1-{config.split}-{config.seed}"
     (config.out / f"{named}.json").write_text(report.dumps(result) + "\n")
     if ours is not None:
@@ -268,6 +304,8 @@ def table(result: dict[str, Any]) -> str:
         cells = [values.get(column) for column in COLUMNS]
         shown = (f"{v:>13,}" if isinstance(v, int) else f"{'-':>13}" if v is None else f"{v:>13.3f}" for v in cells)
         lines.append(f"{name:14}" + "".join(shown) + (f"  {values['note']}" if "note" in values else ""))
+    for name, values in result.get("sensor_loss", {}).items():
+        lines.append(f"  {name:26}" + "  ".join(f"{k} {v:.3f}" for k, v in values.items() if isinstance(v, float)))
     return "\n".join(lines)
 
 

@@ -16,10 +16,12 @@ def result():
 
 def test_every_figure_is_there(result):
     assert set(result) == {
-        "tick_lidar_ms", "scoring", "scoring_error", "plan_ms", "cost_to_go_ms", "planning", "lidar", "camera", "mjx",
-        "episodes_per_s", "episodes", "reference_matmul_ms", "machine",
+        "tick_lidar_ms", "network_ms", "network", "tick_fusion_ms", "scoring", "scoring_error", "plan_ms",
+        "cost_to_go_ms", "planning", "lidar", "camera", "mjx", "episodes_per_s", "episodes", "reference_matmul_ms",
+        "machine",
     }  # fmt: skip
-    assert {"median", "p95", "max", "replan_p95"} <= set(result["tick_lidar_ms"])
+    for tick in ("tick_lidar_ms", "tick_fusion_ms"):
+        assert {"median", "p95", "max", "replan_p95"} <= set(result[tick])
     assert set(result["scoring"]) == set(result["planning"]["threads"]) == {"4096", "65536"}
     assert set(result["planning"]) == {"plan", "cost_to_go", "scaling", "threads"}
     assert {"rays_per_s", "mujoco_rays_per_s", "ratio", "max_error_m"} <= set(result["lidar"])
@@ -33,6 +35,9 @@ def test_figures_fit_together(result):
     tick = result["tick_lidar_ms"]
     assert 0 < tick["median"] <= tick["p95"] <= tick["max"] and tick["replan_median"] <= tick["replan_p95"]
     assert min(*result["scoring"].values(), result["episodes_per_s"], result["reference_matmul_ms"]) > 0
+    network, sees = result["network"], result["tick_fusion_ms"]
+    assert 0 < result["network_ms"] == network["median"] <= network["p95"] <= network["max"]
+    assert sees["ticks"] == tick["ticks"] and 0 < sees["median"] <= sees["max"]
     lidar = result["lidar"]
     assert lidar["ratio"] == pytest.approx(lidar["rays_per_s"] / lidar["mujoco_rays_per_s"])
     assert min(result["mjx"][k] for k in ("steps_per_s", "kinematic_steps_per_s", "native_steps_per_s")) > 0

@@ -28,6 +28,7 @@ RANKS = {
     "bench_sensors": 3,
     "bench_planning": 3,
     "bench_physics": 3,
+    "bench_network": 3,
     "report": 3,
     "sources": 3,
     "navigator": 2,
@@ -47,6 +48,7 @@ SIDEWAYS = {
     ("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors"),
     ("bench", "bench_planning"), ("bench", "bench_physics"), ("bench_planning", "evaluate"),
     ("bench_planning", "bench_sensors"), ("bench_physics", "bench_sensors"),
+    ("bench", "bench_network"), ("bench_network", "bench_planning"),
 }  # fmt: skip
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400

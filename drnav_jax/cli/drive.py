@@ -13,6 +13,7 @@ import jax
 from drnav_jax import __version__, evaluate, report, sources
 from drnav_jax.cli.flags import Compare, Run, Trial
 from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.models import weights
 from drnav_jax.planning import planner
 from drnav_jax.sim import episode
 from drnav_jax.viz import MissingExtra
@@ -46,9 +47,22 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
     names = [args.planner] if isinstance(args, Run) else [name.strip() for name in args.planners.split(",")]
     if len(set(names)) < len(names):
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
-    same = ("predictor", "weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
+    same = ("weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
     common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
-    return {name: evaluate.Setup(planner=name, **common) for name in names}
+    predictor, lack = args.predictor, lacking(args)
+    if predictor == "fusion" and lack:
+        print(f"drnav: {lack}: the geometric rule predicts dead ends instead of the network.", file=sys.stderr)
+        predictor = "geometric"
+    return {name: evaluate.Setup(planner=name, predictor=predictor, **common) for name in names}
+
+
+def lacking(args: Run | Compare) -> str:
+    """What the fusion network lacks here, or "". A file that was asked for must be there."""
+    if args.no_cameras:
+        return "the robot has no cameras"
+    if args.weights is None and not weights.SHIPPED.is_file():
+        return "this installation has no weights of the fusion network (train some with drnav train, give --weights)"
+    return ""
 
 
 def folder_of(args: Run | Compare) -> Path:
@@ -113,7 +127,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
     believers = [name for name in finished.evaluations if planner(name).risk_in_route or planner(name).exposure]
     first = (believers or list(finished.evaluations))[0]
     setup, evaluation = setups[first], finished.evaluations[first]
-    spec = evaluate.spec_of(setup.planner, setup.predictor, setup.num_candidates, setup.weights)
+    spec = setup.nav
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
     params = evaluate.episode_params(trips, setup)  # of all, so that worlds have the shapes that were compiled for
     for number, k in enumerate(evaluation.kept[:PICTURES], 1):

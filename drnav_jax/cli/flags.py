@@ -38,6 +38,7 @@ class Trial:
         episodes: Worlds of a family; sampled trips on a map; repeats, with other sensor noise, of a given trip.
         predictor: Where dead-end evidence comes from.
         weights: Of the fusion network, from `drnav train`.
+        no_cameras: The robot has a LiDAR only; the geometric rule stands in for the network.
         risk_weight: Lambda of eq. 1 and 7; 0 = dead ends do not matter.
         horizon: H, how far ahead candidates are rolled out [s].
         seed: Of sensor noise and of sampled trips.
@@ -62,8 +63,9 @@ class Trial:
     start: Annotated[str | None, _flag("X,Y,YAW", "default: the world's own, or sampled")] = None
     goal: Annotated[str | None, _flag("X,Y", "default: the world's own, or sampled")] = None
     episodes: Annotated[int, _flag("N")] = 1
-    predictor: Literal["fusion", "geometric", "oracle", "none"] = "geometric"
+    predictor: Literal["fusion", "geometric", "oracle", "none"] = "fusion"
     weights: Annotated[Path | None, _flag("FILE", "default: those that come with drnav")] = None
+    no_cameras: bool = False
     risk_weight: Annotated[float | None, _flag("F", "default: the planner's")] = None
     horizon: Annotated[float | None, _flag("S", "default: the planner's, 4 s")] = None
     seed: Annotated[int, _flag("N")] = 0

@@ -23,11 +23,18 @@ class FrameSpec:
         rig: The cameras.
         lidar: The beams.
         bev: The grid of maps and labels.
+        lost: Share of the beams that is lost; None = drawn for each world, 0 to 5 %.
     """
 
     rig: RigSpec = RigSpec()
     lidar: LidarSpec = LidarSpec()
     bev: BevSpec = BevSpec()
+    lost: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the share."""
+        if self.lost is not None and not 0 <= self.lost <= 1:
+            raise ValueError(f"lost must be a share of 0..1, got {self.lost}.")
 
 
 class Frame(NamedTuple):

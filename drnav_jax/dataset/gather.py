@@ -47,11 +47,12 @@ def _mount(mount: Mount, rng: np.random.Generator) -> Mount:
 
 def _sensors(spec: FrameSpec, rng: np.random.Generator) -> Sensors:
     rig = RigSpec(tuple(_mount(m, rng) for m in spec.rig.mounts), spec.rig.shape)
+    lidar = LidarParams(
+        max_range=rng.uniform(5.0, 12.0) if rng.random() < SHORT else 12.0,
+        noise_std=rng.uniform(0.01, 0.03), dropout=rng.uniform(0.0, 0.05), height=rng.uniform(0.4, 0.6)
+    )  # fmt: skip
     return Sensors(
-        lidar=LidarParams(
-            max_range=rng.uniform(5.0, 12.0) if rng.random() < SHORT else 12.0,
-            noise_std=rng.uniform(0.01, 0.03), dropout=rng.uniform(0.0, 0.05), height=rng.uniform(0.4, 0.6)
-        ),
+        lidar=lidar if spec.lost is None else lidar._replace(dropout=spec.lost),
         camera=CameraParams(noise_std=rng.uniform(0.005, 0.03), blur=rng.uniform(0.0, 0.15)),
         rig=rig_of(rig),
     )

@@ -46,8 +46,8 @@ class DatasetSpec:
     seed: int
     families: tuple[str, ...]
     ticks: int = 12
-    num_worlds: int = 24
-    per_world: int = 20
+    num_worlds: int = 48
+    per_world: int = 8
 
     def __post_init__(self) -> None:
         """Check ranges."""

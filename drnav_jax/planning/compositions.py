@@ -47,6 +47,11 @@ class Composition:
         return self.headings
 
     @property
+    def predicts(self) -> bool:
+        """Whether dead-end evidence matters to it."""
+        return self.risk_in_route or self.exposure
+
+    @property
     def follows(self) -> bool:
         """Whether the tracker follows a path."""
         return self.tracker != "dwa"

@@ -65,7 +65,7 @@ def mirrored(batch: Batch) -> Batch:
     )  # fmt: skip
 
 
-def _turned(rig: CameraRig, shift: Array, angles: Array) -> CameraRig:
+def turned(rig: CameraRig, shift: Array, angles: Array) -> CameraRig:
     """A rig as it is believed to be: `shift` [N, 3] and small rotation `angles` [N, 3] off."""
     a, b, c = angles[:, 0], angles[:, 1], angles[:, 2]
     one = jnp.ones_like(a)
@@ -84,7 +84,7 @@ def _sensors(params: AugmentParams, x: Inputs, key: PRNGKeyArray) -> Inputs:
     share = jnp.where(chance(params.black), share, 0.0)
     lit = ~chance(share, x.images.shape[:3])
     images = jnp.clip(shares(x.images) * gain, 0.0, 1.0) * lit[..., None].astype(jnp.float32)
-    rig = _turned(x.rig, params.shift * normal((cameras, 3)), params.turn * normal((cameras, 3)))
+    rig = turned(x.rig, params.shift * normal((cameras, 3)), params.turn * normal((cameras, 3)))
     # whole sensors
     usable = x.image_valid & ~chance(params.one_camera, (cameras,)) & ~chance(params.all_cameras)
     blind = chance(params.no_lidar) & jnp.any(usable)
