@@ -66,3 +66,89 @@ def test_ratio_of_means_is_paired():
             metrics.ratio_of_means(wrong, theirs)
     with pytest.raises(ValueError, match="paired"):
         metrics.ratio_of_means(np.ones(0), np.ones(0))
+
+
+def scored(seed, ties=True, count=60):
+    """Scores and truths; with ties between and within both kinds."""
+    rng = np.random.default_rng(seed)
+    truth = rng.random(count) < 0.3
+    scores = np.clip(rng.normal(size=count) * 0.3 + 0.2 * truth + 0.4, 0, 1)
+    return (np.round(scores, 1) if ties else scores), truth
+
+
+@pytest.mark.parametrize("ties", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_auroc_is_the_share_of_pairs_in_the_right_order(seed, ties):
+    scores, truth = scored(seed, ties)
+    pairs = [(a > b) + 0.5 * (a == b) for a in scores[truth] for b in scores[~truth]]
+    assert metrics.auroc(scores, truth) == pytest.approx(np.mean(pairs), abs=1e-12)
+    assert metrics.auroc(scores.reshape(6, 10), truth.reshape(6, 10)) == metrics.auroc(scores, truth)
+    assert metrics.auroc(-scores, truth) == pytest.approx(1 - np.mean(pairs), abs=1e-12)
+
+
+@pytest.mark.parametrize("ties", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_average_precision_sums_over_thresholds(seed, ties):
+    """Taken at each distinct score: precision there, times the recall gained since the one above."""
+    scores, truth = scored(seed, ties)
+    area, before = 0.0, 0.0
+    for threshold in sorted(set(scores), reverse=True):
+        said = scores >= threshold
+        precision, recall = (said & truth).sum() / said.sum(), (said & truth).sum() / truth.sum()
+        area, before = area + precision * (recall - before), recall
+    assert metrics.average_precision(scores, truth) == pytest.approx(area, abs=1e-12)
+    order = np.random.default_rng(9).permutation(len(scores))
+    assert metrics.average_precision(scores[order], truth[order]) == pytest.approx(area, abs=1e-12)
+
+
+@pytest.mark.parametrize("bins", [1, 7, 15])
+def test_calibration_error_is_that_of_a_loop_over_bins(bins):
+    rng = np.random.default_rng(0)
+    p = np.concatenate([rng.random(200), [0.0, 1.0, 1.0, 0.5]])
+    truth = np.concatenate([rng.random(200) < p[:200] ** 2, [False, True, False, True]])
+    total = 0.0
+    for k in range(bins):
+        low, high = k / bins, (k + 1) / bins
+        inside = (p >= low) & ((p < high) | (k == bins - 1))  # 1 belongs to the last
+        if inside.any():
+            total += inside.sum() * abs(p[inside].mean() - truth[inside].mean())
+    assert metrics.calibration_error(p, truth, bins) == pytest.approx(total / len(p), abs=1e-12)
+
+
+def test_a_calibrated_judge_has_no_error_and_a_sure_and_wrong_one_has_the_largest():
+    p = np.repeat([0.25, 0.75], 400)
+    truth = np.concatenate([np.arange(400) < 100, np.arange(400) < 300])
+    assert metrics.calibration_error(p, truth) == pytest.approx(0.0, abs=1e-12)
+    assert metrics.calibration_error(1.0 - truth, truth) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_f1_and_balanced_accuracy_from_counts(seed):
+    rng = np.random.default_rng(seed)
+    said, truth = rng.random((5, 8)) < 0.4, rng.random((5, 8)) < 0.3
+    table = {(a, b): 0 for a in (0, 1) for b in (0, 1)}
+    for a, b in zip(said.ravel(), truth.ravel(), strict=True):
+        table[int(a), int(b)] += 1
+    precision, recall = table[1, 1] / (table[1, 1] + table[1, 0]), table[1, 1] / (table[1, 1] + table[0, 1])
+    assert metrics.f1(said, truth) == pytest.approx(2 * precision * recall / (precision + recall))
+    specificity = table[0, 0] / (table[0, 0] + table[1, 0])
+    assert metrics.balanced_accuracy(said, truth) == pytest.approx((recall + specificity) / 2)
+
+
+@pytest.mark.parametrize("truth", [np.ones(4, bool), np.zeros(4, bool), np.zeros(0, bool)])
+def test_one_kind_alone_has_no_auroc_and_no_balanced_accuracy(truth):
+    scores = np.linspace(0, 1, truth.size)
+    assert np.isnan(metrics.auroc(scores, truth)) and np.isnan(metrics.balanced_accuracy(scores > 0.5, truth))
+
+
+def test_other_degenerate_inputs():
+    none, all_ = np.zeros(4, bool), np.ones(4, bool)
+    scores = np.array([0.1, 0.4, 0.4, 0.9])
+    assert np.isnan(metrics.average_precision(scores, none)) and metrics.average_precision(scores, all_) == 1.0
+    assert np.isnan(metrics.f1(none, none)) and metrics.f1(none, all_) == 0.0 and metrics.f1(all_, all_) == 1.0
+    assert np.isnan(metrics.calibration_error(np.zeros(0), np.zeros(0, bool)))
+    flat = np.full(4, 0.5)  # who says the same of all
+    assert metrics.auroc(flat, scores > 0.3) == 0.5 and metrics.average_precision(flat, scores > 0.3) == 0.75
+    for measure in (metrics.auroc, metrics.average_precision, metrics.calibration_error):
+        with pytest.raises(ValueError, match="one shape"):
+            measure(scores, np.zeros(3, bool))

@@ -30,8 +30,12 @@ def perform(args: Train) -> int:
         raise ValueError("give either --data DIR or --stream.")
     spec = train.read(args.config)
     process.use_every_core()
+    validation = _validation(args)
     if args.data is not None:
         folder = args.data
+        count = len(dataset.FrameSource(folder))  # mistakes come before --out is begun
+        if count < spec.batch_size:
+            raise ValueError(f"{folder} holds {count} frames: a batch has {spec.batch_size}.")
         source = lambda first: dataset.batches(folder, spec.batch_size, spec.seed, first=first)  # noqa: E731
     else:
         worlds = dataset.spec_of(1, "train", spec.seed)
@@ -40,7 +44,7 @@ def perform(args: Train) -> int:
     try:
         with stdout_kept(args.json):
             said = lambda step, figures: bar(step, note=_note(figures))  # noqa: E731
-            result = train.train(spec, source, _validation(args), args.out, resume=args.resume, progress=said)
+            result = train.train(spec, source, validation, args.out, resume=args.resume, progress=said)
     except KeyboardInterrupt:
         print(f"drnav: interrupted; the same command with --resume goes on in {args.out}/", file=sys.stderr)
         return INTERRUPTED

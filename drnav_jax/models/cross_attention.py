@@ -99,7 +99,7 @@ class Integration(nn.Module):
     ) -> Float[Array, "b f"]:  # fmt: skip
         """The joint embedding; zero stands for what is missing."""
         tokens, mask = jnp.concatenate([image, lidar], axis=1), jnp.concatenate([image_mask, lidar_mask], axis=1)
-        highest = jnp.max(jnp.where(mask[..., None], tokens, -jnp.inf), axis=1)
+        highest = jnp.max(jnp.where(mask[..., None], tokens, -jnp.inf), axis=1, initial=-jnp.inf)
         highest = jnp.where(jnp.any(mask, axis=1)[:, None], highest, 0.0)
         joined = [masked_mean(image, image_mask), masked_mean(lidar, lidar_mask), highest]
         inner = nn.silu(Dense(self.features, name="inner")(jnp.concatenate(joined, axis=-1)))

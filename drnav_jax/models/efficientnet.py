@@ -98,14 +98,14 @@ class EncoderSpec:
         """(rows, columns) of the feature map at a stride, for images of a shape."""
         kernel, first, _ = self.stem
         shape = shape if self.resolution is None else self.resolution
-        plan = [(kernel, first)] + [(k, s) for _, _, k, s, _ in self.blocks()]
-        now = 1
-        for k, s in plan:
-            if now * s > stride:
-                break
+        rows, columns = (n // first if kernel == first else size_after(n, kernel, first) for n in shape)
+        now = first
+        for _, _, k, s, _ in self.blocks():
             now *= s
-            shape = tuple(n // s if k == s else size_after(n, k, s) for n in shape)  # pyright: ignore
-        return shape
+            if now > stride:
+                break
+            rows, columns = size_after(rows, k, s), size_after(columns, k, s)
+        return rows, columns
 
 
 def b0(width: float = 1.0, depth: float = 1.0, **changes) -> EncoderSpec:

@@ -106,7 +106,7 @@ class Norm(nn.Module):
 def masked_softmax(scores: Float[Array, "*s k"], mask: Bool[Array, "*#s k"]) -> Float[Array, "*s k"]:
     """Softmax over the entries that the mask holds; all zero where it holds none."""
     scores = jnp.where(mask, scores, -jnp.inf)
-    top = jax.lax.stop_gradient(jnp.max(scores, axis=-1, keepdims=True))
+    top = jax.lax.stop_gradient(jnp.max(scores, axis=-1, keepdims=True, initial=-jnp.inf))
     weights = jnp.where(mask, jnp.exp(scores - jnp.where(jnp.isfinite(top), top, 0.0)), 0.0)
     return weights / jnp.maximum(jnp.sum(weights, axis=-1, keepdims=True), 1e-9)
 

@@ -21,12 +21,13 @@ from drnav_jax.models.layers import Dense, lecun_normal
 from drnav_jax.types import BevSpec, CameraRig
 
 DEPTHS = (0.5, 12.0)  # [m] nearest and farthest depth
+SLOPES = 16  # E: fixed, so that parameters do not depend on the size of the images
 STEEPEST = 1.0  # slopes lie in ± this
 _HEIGHT = 0.5  # share of a camera's height at which cells are looked for
 
 
 def row_weights(
-    rig: CameraRig, pixels: tuple[int, int], cells: tuple[int, int], num_slopes: int
+    rig: CameraRig, pixels: tuple[int, int], cells: tuple[int, int], num_slopes: int = SLOPES
 ) -> Float[Array, "b n j e r"]:
     """Eq. 1: how rows are brought to slopes, for each column.
 
@@ -117,7 +118,6 @@ class Lift(nn.Module):
     Attributes:
         bev: The grid.
         cell: Grid cells along an edge of the cells that come out.
-        num_slopes: E.
         num_depths: T.
         hidden: Channels per column.
         features: Channels that come out.
@@ -125,7 +125,6 @@ class Lift(nn.Module):
 
     bev: BevSpec
     cell: int
-    num_slopes: int
     num_depths: int
     hidden: int
     features: int
@@ -145,10 +144,10 @@ class Lift(nn.Module):
             pixels: (rows, columns) of the images that the rig counts in.
         """
         b, n, rows, columns, c = maps.shape
-        weights = row_weights(rig, pixels, (rows, columns), self.num_slopes)
+        weights = row_weights(rig, pixels, (rows, columns))
         by_column = maps.transpose(0, 1, 3, 2, 4)
         levelled = jnp.einsum("bnjer,bnjrc->bnjec", weights, by_column)
-        flat = levelled.reshape(b, n, columns, self.num_slopes * c)
+        flat = levelled.reshape(b, n, columns, SLOPES * c)
         inner = Dense(self.hidden, name="column")(flat) + Dense(self.hidden, bias=False, name="camera")(camera)[:, :, None]
         spread = Dense(self.num_depths * self.features, kernel_init=lecun_normal, name="depths")(nn.relu(inner))
         table = spread.reshape(b, n * columns * self.num_depths, self.features)

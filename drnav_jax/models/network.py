@@ -134,10 +134,11 @@ class _Network(nn.Module):
         b, n, rows, columns = inputs.images.shape[:4]
         usable = inputs.image_valid
         images = jnp.where(usable[:, :, None, None, None], shares(inputs.images), 0.0)
+        rig = jax.tree.map(lambda a: jnp.where(usable.reshape(b, n, *[1] * (a.ndim - 2)), a, 1.0), inputs.rig)
         maps = EfficientNet(spec.encoder, name="encoder")(images.reshape(b * n, rows, columns, 3))
         strides = spec.encoder.strides
         tokens, alpha = PatchAttention(spec.features, spec.image_tokens, name="patches")(maps[strides[-1]])
-        camera = RigEmbedding(spec.features, name="rig")(inputs.rig, (rows, columns))
+        camera = RigEmbedding(spec.features, name="rig")(rig, (rows, columns))
         tokens = tokens.reshape(b, n, spec.image_tokens, spec.features) + camera[:, :, None, :]
         place = self.param("image_place", nn.initializers.normal(0.1, jnp.float32), (spec.image_tokens, spec.features))
         tokens = (tokens + place[None, None]).reshape(b, n * spec.image_tokens, spec.features)
@@ -148,10 +149,8 @@ class _Network(nn.Module):
         if spec.lifts:
             seen = _pyramid(self.spec, maps)
             seen = seen.reshape(b, n, *seen.shape[1:])
-            lift = Lift(
-                spec.bev, 2, seen.shape[2], spec.lift_depths, spec.features, spec.lift_features, name="lift"
-            )
-            lifted = lift(seen, camera, inputs.rig, usable, (rows, columns))
+            lift = Lift(spec.bev, 2, spec.lift_depths, spec.features, spec.lift_features, name="lift")
+            lifted = lift(seen, camera, rig, usable, (rows, columns))
         return tokens, mask, alpha, lifted
 
     def _scan(self, inputs: Inputs) -> tuple[Array, Array, Array]:
@@ -178,6 +177,8 @@ class _Network(nn.Module):
         alpha, beta = jnp.zeros((b, n, 1, 1), jnp.float32), jnp.zeros(inputs.points.shape[:2], jnp.float32)
         if spec.sees and n:
             image, image_mask, alpha, lifted = self._see(inputs)
+        elif spec.lifts:  # no camera sees any cell
+            lifted = jnp.zeros((b, spec.bev.shape[0] // 2, spec.bev.shape[1] // 2, spec.lift_features + 1), jnp.float32)
         if spec.scans:
             lidar, lidar_mask, beta = self._scan(inputs)
         fusion = CrossModal(spec.num_heads, spec.attention_layers, name="fusion")

@@ -63,7 +63,7 @@ class PointNet(nn.Module):
         h = point_features(points)
         for number, width in enumerate(self.widths):
             h = nn.relu(Dense(width, name=f"point{number}")(h))
-        u = jnp.max(jnp.where(valid[..., None], h, 0.0), axis=1)  # h >= 0
+        u = jnp.max(jnp.where(valid[..., None], h, 0.0), axis=1, initial=0.0)  # h >= 0
         inner = Dense(16, name="score_point")(h) + Dense(16, bias=False, name="score_scan")(u)[:, None, :]
         scores = Dense(self.num_heads, kernel_init=lecun_normal, name="score")(nn.relu(inner))
         weights = jnp.exp(_BOUND * jnp.tanh(scores / _BOUND)) * valid[..., None].astype(jnp.float32)

@@ -18,11 +18,28 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
 
 
+_WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text", tuple: "a list"}
+
+
+def _fits(kind: type, value: Any) -> bool:
+    """Whether a value may stand where the default is of a kind; a whole number is a number, true and false are none."""
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, list | tuple) if kind is tuple else type(value) is kind
+
+
+def _default(kind: Any, name: str) -> Any:
+    if hasattr(kind, "_fields"):
+        return kind._field_defaults.get(name)
+    field = next(f for f in dataclasses.fields(kind) if f.name == name)
+    return None if field.default is dataclasses.MISSING else field.default
+
+
 def built(kind: Any, values: dict[str, Any], where: str = "") -> Any:
     """A Spec or Params from mappings; what is not named keeps its default.
 
     Raises:
-        ValueError: If a name is unknown, or a value out of range.
+        ValueError: If a name is unknown, or a value of another kind than the default, or out of range.
     """
     named = kind._fields if hasattr(kind, "_fields") else tuple(f.name for f in dataclasses.fields(kind))
     unknown = sorted(set(values) - set(named))
@@ -32,6 +49,13 @@ def built(kind: Any, values: dict[str, Any], where: str = "") -> Any:
     fields = {}
     for name, value in values.items():
         nested = dataclasses.is_dataclass(kinds[name]) or hasattr(kinds[name], "_fields")
-        deeper = nested and isinstance(value, dict)
-        fields[name] = built(kinds[name], value, f"{where}{name}.") if deeper else _tuples(value)
+        if nested:
+            if not isinstance(value, dict):
+                raise ValueError(f"{where}{name} must be a mapping of settings, got {value!r}.")
+            fields[name] = built(kinds[name], value, f"{where}{name}.")
+            continue
+        usual = type(_default(kind, name))
+        if usual in _WORDS and not _fits(usual, value):
+            raise ValueError(f"{where}{name} must be {_WORDS[usual]}, got {value!r}.")
+        fields[name] = float(value) if usual is float else _tuples(value)
     return kind(**fields)

@@ -110,7 +110,10 @@ def load(file: Path = SHIPPED, expected: NetworkSpec | None = None) -> Trained:
     if _digest(arrays) != metadata.get("sha256"):
         raise ValueError(f"{file} is damaged: its arrays do not have the hash it names; fetch or train it again.")
     about = json.loads(metadata["about"])
-    spec = settings.built(NetworkSpec, about["spec"])
+    try:
+        spec = settings.built(NetworkSpec, about["spec"])
+    except ValueError as error:
+        raise ValueError(f"{file} is of another version ({error}): train it anew.") from None
     if expected is not None and spec != expected:
         mine, theirs = settings.plain(expected), settings.plain(spec)
         other = ", ".join(k for k in mine if mine[k] != theirs[k])

@@ -69,6 +69,13 @@ class Checkpoints:
         shapes: Any = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), jax.device_get(like))
         try:
             held: Any = manager.restore(step, args=self._ocp.args.StandardRestore(shapes))
+            other = [  # orbax pads and cuts arrays of other shapes
+                f"{jax.tree_util.keystr(path)} has shape {a.shape}, not {b.shape}"
+                for (path, a), b in zip(jax.tree.leaves_with_path(held), jax.tree.leaves(shapes), strict=True)
+                if a.shape != b.shape
+            ]
+            if other:
+                raise ValueError(other[0])
             return held
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(

@@ -17,7 +17,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from drnav_jax.models import calibration, settings, weights
 from drnav_jax.models.batch import Batch, batch_of
-from drnav_jax.models.calibration import Calibration
+from drnav_jax.models.calibration import Calibration, Temperature
 from drnav_jax.train import validate
 from drnav_jax.train.augment import trimmed
 from drnav_jax.train.checkpoints import Checkpoints
@@ -152,14 +152,16 @@ def train(
 
 
 def fitted(spec: TrainSpec, params: Any, validation: Iterable[Batch]) -> Calibration:
-    """Temperatures from the validation frames."""
+    """Temperatures from the validation frames; a head keeps its raw logits where they are all of one kind."""
     raw = validate.predict(spec.network, params, validation)
     t = raw.targets
     assert raw.dead is not None
     logit = lambda p: np.log(np.clip(p, 1e-6, 1 - 1e-6)) - np.log1p(-np.clip(p, 1e-6, 1 - 1e-6))  # noqa: E731
     dead = raw.dead.astype(np.float32) / 65535
+
+    def fit(p: np.ndarray, truth: np.ndarray) -> Temperature:  # frames of one kind only: as it is
+        return calibration.fit(logit(p), truth) if truth.any() and not truth.all() else Temperature()
+
     return Calibration(
-        path=calibration.fit(logit(raw.path), t.path),
-        flag=calibration.fit(logit(raw.flag), t.dead_end_flag),
-        dead=calibration.fit(logit(dead[t.valid]), t.dead_end[t.valid]),
+        path=fit(raw.path, t.path), flag=fit(raw.flag, t.dead_end_flag), dead=fit(dead[t.valid], t.dead_end[t.valid])
     )

@@ -88,7 +88,7 @@ def stepper(spec: TrainSpec, mesh: Mesh) -> Callable[[TrainState, Batch], tuple[
     @partial(jax.jit, in_shardings=(everywhere, split), out_shardings=everywhere, donate_argnums=0)
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, Array]]:
         gradient, said = shared(state.params, batch, state.step)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         sound = jnp.isfinite(norm)  # a batch that breaks the arithmetic teaches nothing
         gradient = jax.tree.map(lambda g: jnp.where(sound, g, 0.0), gradient)
         updates, kept = tools.update(gradient, state.optimiser, state.params)
