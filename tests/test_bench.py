@@ -4,14 +4,19 @@ import json
 
 import numpy as np
 import pytest
+from small_network import SPEC, params_of
 
-from drnav_jax import bench, bench_planning, grids
+from drnav_jax import bench, bench_network, bench_planning, grids
+from drnav_jax.models.calibration import Calibration
+from drnav_jax.models.weights import Trained
 from drnav_jax.planning import scoring
 
 
 @pytest.fixture(scope="module")
 def result():
-    return bench.run(quick=True)
+    with pytest.MonkeyPatch.context() as patch:  # a network that compiles in seconds
+        patch.setattr(bench_network, "installed", lambda: Trained(SPEC, params_of(), Calibration(), {}, ""))
+        return bench.run(quick=True)
 
 
 def test_every_figure_is_there(result):

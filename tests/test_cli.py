@@ -11,6 +11,7 @@ from PIL import Image
 from drnav_jax import cli, evaluate, report
 from drnav_jax.cli import drive
 from drnav_jax.cli.terminal import Bar
+from drnav_jax.models import weights
 from drnav_jax.viz import MissingExtra
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -23,7 +24,9 @@ SHORT = ["--world", "u:0", "--episodes", "2", "--time-limit", "2"]
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
+    """In an empty folder, and without the network, which compiles for longer than all this takes."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(weights, "SHIPPED", tmp_path / "nothing.safetensors")
 
 
 def call(capsys, *argv) -> tuple[int, str, str]:
@@ -193,6 +196,25 @@ def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, mon
     assert out == Path("x/summary.json").read_text()
     code, out, err = call(capsys, "compare", *SHORT, "--planners", "grid,dwa", "--json", "--out", "y")
     assert (code, out) == (130, "") and "nothing is written" in err
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [((), "no weights of the fusion network (train some"), (("--no-cameras",), "the robot has no cameras")],
+)
+def test_the_rule_stands_in_for_the_network(capsys, flags, message):
+    short = ("run", "--world", "u:0", "--time-limit", "1", "--no-pictures", "--json")
+    code, out, err = call(capsys, *short, *flags, "--out", "x")
+    assert code == 0 and message in err and "the geometric rule predicts dead ends" in err
+    assert json.loads(out)["predictor"] == "geometric" and json.loads(out)["config"]["predictor"] == "fusion"
+    code, same, err = call(capsys, *short, "--predictor", "geometric", "--out", "y")
+    assert code == 0 and "network" not in err
+    assert json.loads(out)["episodes"] == json.loads(same)["episodes"]
+
+
+def test_weights_that_are_named_must_be_there(capsys):
+    code, _, err = call(capsys, "run", "--world", "u:0", "--weights", "none.safetensors")
+    assert code == 2 and "none.safetensors" in err.splitlines()[-1]
 
 
 def test_progress_bar_on_a_terminal(monkeypatch):

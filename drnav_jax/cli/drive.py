@@ -49,15 +49,17 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
     same = ("weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
     common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
-    predictor, lack = args.predictor, lacking(args)
-    if predictor == "fusion" and lack:
-        print(f"drnav: {lack}: the geometric rule predicts dead ends instead of the network.", file=sys.stderr)
-        predictor = "geometric"
-    return {name: evaluate.Setup(planner=name, predictor=predictor, **common) for name in names}
+    return {name: evaluate.Setup(planner=name, predictor=_predictor(args), **common) for name in names}
+
+
+def _predictor(args: Run | Compare) -> str:
+    return "geometric" if lacking(args) else args.predictor
 
 
 def lacking(args: Run | Compare) -> str:
-    """What the fusion network lacks here, or "". A file that was asked for must be there."""
+    """What the fusion network lacks here if it is asked for, or "". A file that was named must be there."""
+    if args.predictor != "fusion":
+        return ""
     if args.no_cameras:
         return "the robot has no cameras"
     if args.weights is None and not weights.SHIPPED.is_file():
@@ -111,7 +113,8 @@ def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
     elif args.barn is not None:
         rule = "100 s, as BARN has it"
     head = {
-        "command": _command(args), "version": __version__, "config": config, "time_limit_rule": rule,
+        "command": _command(args), "version": __version__, "config": config, "predictor": _predictor(args),
+        "time_limit_rule": rule,
         "optimal_rule": "shortest any-angle path at the robot's radius + planning margin, over the fastest speed",
         "interrupted": finished.interrupted,
     }  # fmt: skip
@@ -161,6 +164,8 @@ def perform(args: Run | Compare) -> int:
     setups = setups_of(args)
     trips = evaluate.prepare(scenes_of(args), next(iter(setups.values())))
     out = folder_of(args)
+    if lack := lacking(args):
+        print(f"drnav: {lack}: the geometric rule predicts dead ends instead of the network.", file=sys.stderr)
     with stdout_kept(args.json):
         finished = drive(trips, setups)
     if not finished.evaluations:
