@@ -4,7 +4,7 @@ import json
 
 import pytest
 import yaml
-from small_network import SPEC, frames, params_of
+from small_network import LEAST, frames, params_of
 
 from drnav_jax.cli import learn, main
 from drnav_jax.dataset.shards import DatasetSpec, write
@@ -59,7 +59,7 @@ def test_sets_that_are_too_small(capsys, tmp_path):
 @pytest.mark.relaxed  # flax
 def test_a_short_training(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(network, "init", lambda key, spec: params_of(spec))  # which compiles for longer than all this takes
-    config = {"network": settings.plain(SPEC), "steps": 2, "batch_size": 4, "warmup": 1}
+    config = {"network": settings.plain(LEAST), "steps": 2, "batch_size": 4, "warmup": 1}
     (tmp_path / "run.yaml").write_text(yaml.safe_dump(config))
     data, held_out = gathered(tmp_path / "data", 16, 0), gathered(tmp_path / "val", 64, 1)
     argv = ["train", "--out", tmp_path / "run", "--data", data, "--validation", held_out, "--config", tmp_path / "run.yaml"]
@@ -68,7 +68,7 @@ def test_a_short_training(capsys, tmp_path, monkeypatch):
     figures = json.loads(out)
     assert figures["step"] == 2 and 0 <= figures["accuracy"] <= 1 and {"samples_per_s", "interior_auroc"} <= set(figures)
     assert f"wrote {tmp_path / 'run' / 'weights.safetensors'}" in err
-    trained = weights.load(tmp_path / "run" / "weights.safetensors", SPEC)
+    trained = weights.load(tmp_path / "run" / "weights.safetensors", LEAST)
     assert trained.notes["figures"]["accuracy"] == pytest.approx(figures["accuracy"])
     assert "give --resume to go on with it" in said(capsys, *argv[1:])
     assert "begun with another seed" in said(capsys, *argv[1:-1], other(tmp_path, config | {"seed": 3}), "--resume")

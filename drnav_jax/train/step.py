@@ -4,8 +4,8 @@
 (2)  θ <- AdamW(θ, clip(g)),  θ̄ <- d θ̄ + (1 - d) θ,  d = min(ema, (1 + t) / (10 + t))
 """
 
+import functools
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -56,8 +56,11 @@ def mesh_of(devices: list[Any], batch_size: int) -> Mesh:
     return Mesh(devices[:count], (AXIS,))
 
 
+@functools.cache
 def stepper(spec: TrainSpec, mesh: Mesh) -> Callable[[TrainState, Batch], tuple[TrainState, dict[str, Array]]]:
     """(state, batch) -> the state after a step, and what to log; compiled, the batch on axis 0 shared by the devices.
+
+    The same function for the same arguments, so that nothing compiles twice.
 
     Args:
         spec: The run.
@@ -85,7 +88,7 @@ def stepper(spec: TrainSpec, mesh: Mesh) -> Callable[[TrainState, Batch], tuple[
     )  # fmt: skip
     everywhere, split = NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec(AXIS))
 
-    @partial(jax.jit, in_shardings=(everywhere, split), out_shardings=everywhere, donate_argnums=0)
+    @functools.partial(jax.jit, in_shardings=(everywhere, split), out_shardings=everywhere, donate_argnums=0)
     def step(state: TrainState, batch: Batch) -> tuple[TrainState, dict[str, Array]]:
         gradient, said = shared(state.params, batch, state.step)
         norm = optax.tree.norm(gradient)
