@@ -1,7 +1,10 @@
 """What a training run is: from a file, checked before anything runs."""
 
+from pathlib import Path
+
 import pytest
 
+from drnav_jax.models.network import NetworkSpec
 from drnav_jax.train import TrainSpec, read
 
 
@@ -48,3 +51,15 @@ def test_mistakes_name_the_file_and_the_setting(tmp_path, text, says):
 def test_what_cannot_be_is_refused(changes, says):
     with pytest.raises(ValueError, match=says):
         TrainSpec(**changes)
+
+
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / "experiments").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("file", CONFIGS, ids=lambda file: file.stem)
+def test_runs_that_come_with_the_repository(file):
+    changed = {k for k, v in vars(read(file).network).items() if v != getattr(NetworkSpec(), k)}
+    wanted = {"image_only": {"sensors"}, "lidar_only": {"sensors"}, "no_attention": {"attention_layers"},
+              "no_lift": {"lift"}, "tokens": {"head"}, "fusion": set()}  # fmt: skip
+    assert changed == wanted[file.stem]
+    assert len(CONFIGS) == len(wanted)
