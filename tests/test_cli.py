@@ -214,7 +214,12 @@ def test_the_rule_stands_in_for_the_network(capsys, flags, message):
 
 def test_weights_that_are_named_must_be_there(capsys):
     code, _, err = call(capsys, "run", "--world", "u:0", "--weights", "none.safetensors")
-    assert code == 2 and "none.safetensors" in err.splitlines()[-1]
+    assert code == 2 and err.count("\n") == 1 and "none.safetensors" in err and not Path("results").exists()
+
+
+def test_planners_that_do_not_predict_need_no_predictor(capsys):
+    code, _, err = call(capsys, "run", *SHORT, "--planner", "dwa", "--no-pictures")
+    assert code == 0 and "network" not in err
 
 
 def test_progress_bar_on_a_terminal(monkeypatch):

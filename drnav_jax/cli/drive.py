@@ -49,7 +49,8 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
     same = ("weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
     common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
-    return {name: evaluate.Setup(planner=name, predictor=_predictor(args), **common) for name in names}
+    common["predictor"] = _predictor(args)
+    return {name: evaluate.Setup(planner=name, **common) for name in names}
 
 
 def _predictor(args: Run | Compare) -> str:
@@ -127,7 +128,7 @@ def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
 
 def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], finished: Finished) -> None:
     """Pictures of the first episodes with the belief of the first planner that has one, a film of the first episode."""
-    believers = [name for name in finished.evaluations if planner(name).risk_in_route or planner(name).exposure]
+    believers = [name for name in finished.evaluations if planner(name).predicts]
     first = (believers or list(finished.evaluations))[0]
     setup, evaluation = setups[first], finished.evaluations[first]
     spec = setup.nav
@@ -162,9 +163,12 @@ def perform(args: Run | Compare) -> int:
     """
     begin = time.perf_counter()
     setups = setups_of(args)
+    for setup in setups.values():
+        evaluate.params_of(setup)  # weights that cannot be read are a mistake like any other
     trips = evaluate.prepare(scenes_of(args), next(iter(setups.values())))
     out = folder_of(args)
-    if lack := lacking(args):
+    lack = lacking(args)
+    if lack and any(setup.evidence == "geometric" for setup in setups.values()):
         print(f"drnav: {lack}: the geometric rule predicts dead ends instead of the network.", file=sys.stderr)
     with stdout_kept(args.json):
         finished = drive(trips, setups)
