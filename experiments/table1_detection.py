@@ -25,12 +25,13 @@ import numpy as np
 import tyro
 
 from drnav_jax import dataset, report, viz, worlds
+from drnav_jax.bench_network import latency
 from drnav_jax.models import clip, network, views, vlm, weights
 from drnav_jax.models.batch import NOW, Batch, batch_of
 from drnav_jax.sim.lidar import LidarSpec
 from drnav_jax.train import faults, validate
 from drnav_jax.train.validate import Predictions
-from drnav_jax.types import BevSpec, RigSpec
+from drnav_jax.types import BevSpec
 
 COLUMNS = (
     "accuracy", "accuracy_stable", "balanced_accuracy", "dead_end_f1", "cell_auroc", "cell_auroc_unseen", "cell_ap",
@@ -42,6 +43,9 @@ POORER = {  # LiDARs whose frames are gathered anew
     "10 % of the points": dataset.FrameSpec(lost=0.9),
     "one ring": dataset.FrameSpec(lidar=LidarSpec(rings=1, elevation_min=0.0, elevation_max=0.0)),
 }
+AS_BEFORE = {  # titles of rows of the table beside them
+    "all sensors": "drnav", "network without cameras": "lidar_only", "geometric rule": "geometric",
+}  # fmt: skip
 CHUNK = 60  # frames per call
 REPEATS = 50  # of the timed call
 HERE = Path(__file__).resolve().parent
@@ -107,20 +111,9 @@ def gathered(
         print(f"table1: {done}/{count} frames {name}, {time.perf_counter() - begun:.0f} s", file=sys.stderr)
 
     dataset.write(folder, spec, sensors, progress=said)
-    frames = dataset.batches(folder, CHUNK, 0, epochs=1, workers=0)
-    return [batch_of(frame._asdict()) for frame in frames], spec.families
-
-
-def latency(trained: weights.Trained, num_points: int) -> float:
-    """Median time of one answer [ms]: three cameras, one scan, one frame."""
-    inputs = network.example(trained.spec, RigSpec(), num_points)
-    inputs = jax.tree.map(lambda a: np.ones_like(a) if a.dtype == bool else a, jax.device_get(inputs))
-    spent = []
-    for _ in range(REPEATS):
-        begun = time.perf_counter()
-        jax.block_until_ready(network.infer(trained.spec, trained.params, inputs))
-        spent.append(time.perf_counter() - begun)
-    return 1e3 * float(np.median(spent))
+    source = dataset.FrameSource(folder)  # in its order: the first frames of a larger set are those of a smaller one
+    whole = lambda first: jax.tree.map(lambda *a: np.stack(a), *[source[k] for k in range(first, first + CHUNK)])  # noqa: E731
+    return [batch_of(whole(first)._asdict()) for first in range(0, count, CHUNK)], spec.families
 
 
 def row(found: Predictions, extra: dict[str, Any]) -> dict[str, Any]:
@@ -142,8 +135,13 @@ def of_network(file: Path, batches: list[Batch]) -> tuple[Predictions, dict[str,
         return None
     trained = weights.load(file)
     found = validate.predict(trained.spec, trained.params, batches, trained.calibration)
-    ms = latency(trained, batches[0].inputs.points.shape[1])
+    ms = latency(trained, REPEATS, batches[0].inputs.points.shape[1])["median"]
     return found, {"latency_ms": ms, "throughput_hz": 1e3 / ms, "parameters": network.count(trained.params)}
+
+
+def frame(batches: list[Batch], number: int) -> Batch:
+    """One of the frames, without batch axis."""
+    return jax.tree.map(lambda a: np.asarray(a)[number % CHUNK], batches[number // CHUNK])
 
 
 def _of_images(judged: views.Judgement | vlm.Answer, targets: Any) -> Predictions:
@@ -171,9 +169,8 @@ def of_vlm(config: Config, batches: list[Batch]) -> tuple[Predictions, dict[str,
     if not config.vlm_url:
         return "not asked: give --vlm-url"
     spec = vlm.VlmSpec(base_url=config.vlm_url, model=config.vlm_model, key_variable=config.vlm_key)
-    every = jax.tree.map(lambda *a: np.concatenate([np.asarray(part) for part in a]), *batches)
     index = np.unique(np.linspace(0, config.frames - 1, config.vlm_frames).astype(int))
-    x, targets = jax.tree.map(lambda a: a[index], (every.inputs, every.targets))
+    x, targets = jax.tree.map(lambda *a: np.stack(a), *[frame(batches, k) for k in index])
     answer = vlm.ask_all(spec, x.images, x.rig, x.image_valid)
     silent = sorted({problem for problem in answer.problem if problem})
     if all(answer.problem):
@@ -219,33 +216,29 @@ def pictured(
     assert found.dead is not None
     rows = []
     for k in sorted(chosen, key=lambda k: t.family[k]):
-        batch, at = batches[k // CHUNK], k % CHUNK
+        x, true = frame(batches, k)
         fields = ("dead_end", "valid", "visibility", "inside", "interior", "path")
-        ended = "closed" if t.closed[k] else "open"
-        rows.append({name: np.asarray(getattr(t, name))[k] for name in fields} | {
-            "title": f"{families[t.family[k]]}:{t.seed[k]} ({ended})", "images": np.asarray(batch.inputs.images)[at],
-            "local_map": np.asarray(batch.inputs.local_map)[at], "p_dead": found.dead[k] / 65535,
-            "p_open": found.path[k], "p_flag": found.flag[k],
+        ended = "closed" if true.closed else "open"
+        rows.append({name: getattr(true, name) for name in fields} | {
+            "title": f"{families[true.family]}:{true.seed} ({ended})", "images": x.images, "local_map": x.local_map,
+            "p_dead": found.dead[k] / 65535, "p_open": found.path[k], "p_flag": found.flag[k],
         })  # fmt: skip
     return rows
 
 
-def with_losses(config: Config, batches: list[Batch]) -> dict[str, Any]:
+def with_losses(config: Config, batches: list[Batch], judged: dict[str, Predictions]) -> dict[str, Any]:
     """Accuracy on the first frames when sensors fail, next to the rule and the network that knows LiDAR only."""
     usual = batches[: config.loss_frames // CHUNK]
     trained = weights.load(config.weights or weights.SHIPPED)
     ask = lambda frames, change=None: validate.predict(  # noqa: E731
         trained.spec, trained.params, frames, trained.calibration, change
     )
-    found = {"all sensors": ask(usual)}
+    before = {title: judged[name] for title, name in AS_BEFORE.items() if name in judged}
+    found = {title: validate.only(values, np.arange(config.loss_frames)) for title, values in before.items()}
     found |= {name: ask(usual, change) for name, change in faults.cases(config.seed).items()}
     for name, sensors in POORER.items():
         frames, _ = gathered(config, config.loss_frames, sensors, re.sub(r"\W+", "-", name))
         found[name] = ask(frames)
-    lidar_only = of_network(config.ablations / "lidar_only.safetensors", usual)
-    if lidar_only is not None:
-        found["network without cameras"] = lidar_only[0]
-    found["geometric rule"] = validate.by_rule(usual, BevSpec(), 0.25)
     columns = ("accuracy", "accuracy_stable", "dead_end_f1", "cell_auroc")
     said = {name: validate.figures(values) for name, values in found.items()}
     finite = {name: bool(np.isfinite(p.path).all() and np.isfinite(p.flag).all()) for name, p in found.items()}
@@ -258,20 +251,19 @@ def main(config: Config) -> dict[str, Any]:
     batches, families = gathered(config, config.frames, dataset.FrameSpec())
     files = {"drnav": config.weights or weights.SHIPPED}
     files |= {name: config.ablations / f"{name}.safetensors" for name in ABLATIONS}
-    rows, strata, ours, per_family = {}, {}, None, {}
+    rows, strata, judged, per_family = {}, {}, {}, {}
     for name, file in files.items():
         said = of_network(file, batches)
         if said is None:
             rows[name] = {"note": "weights not available"}
             continue
         rows[name], strata[name] = row(*said), by_stratum(said[0])
-        per_family[name] = by_family(said[0], families, families)
-        ours = said[0] if name == "drnav" else ours
+        per_family[name], judged[name] = by_family(said[0], families, families), said[0]
     for name, judge in (("clip", of_clip), ("vlm", of_vlm)):
         said = judge(config, batches)
         rows[name] = {"note": said} if isinstance(said, str) else row(*said)
     begun = time.perf_counter()
-    rule = validate.by_rule(batches, BevSpec(), 0.25)
+    judged["geometric"] = rule = validate.by_rule(batches, BevSpec(), 0.25)
     ms = 1e3 * (time.perf_counter() - begun) / len(rule.path)
     rows["geometric"] = row(rule, {"parameters": 0})
     rows["geometric"]["note"] = f"judging the ways on the rule's map took {ms:.1f} ms per frame on the host"
@@ -285,8 +277,9 @@ def main(config: Config) -> dict[str, Any]:
         "experiment": "table1_detection", "split": config.split, "seed": config.seed, "frames": config.frames,
         "rows": rows, "strata": strata, "families": pick(known), "unseen_families": pick(held),
     }  # fmt: skip
+    ours = judged.get("drnav")
     if ours is not None and config.loss_frames:
-        result["sensor_loss"] = with_losses(config, batches)
+        result["sensor_loss"] = with_losses(config, batches, judged)
     named = f"table1-{config.split}-{config.seed}"
     (config.out / f"{named}.json").write_text(report.dumps(result) + "\n")
     if ours is not None:

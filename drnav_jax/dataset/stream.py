@@ -31,9 +31,9 @@ def stream(
     Raises:
         ValueError: If a round holds less than one batch.
     """
-    per_round = TOGETHER * data.shard_size // max(batch_size, 1)
-    if batch_size < 1 or per_round < 1:
+    if not 1 <= batch_size <= TOGETHER * data.shard_size:
         raise ValueError(f"batch_size must lie within 1..{TOGETHER * data.shard_size}, got {batch_size}.")
+    per_round = TOGETHER * data.shard_size // batch_size
     endless = dataclasses.replace(data, num_frames=max(data.num_frames, data.shard_size))
 
     def made(number: int) -> Frame:

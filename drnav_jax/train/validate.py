@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from drnav_jax import metrics
-from drnav_jax.models import calibration, network
+from drnav_jax.models import calibration, fusion, network
 from drnav_jax.models.batch import NEVER, OCCUPIED, Batch, Inputs, Targets
 from drnav_jax.models.calibration import Calibration
 from drnav_jax.models.network import NetworkSpec
@@ -23,7 +23,7 @@ from drnav_jax.worlds.labels import clearance_of
 from drnav_jax.worlds.openings import Floor, openings
 
 RAW = Calibration()
-NEAR_SEEN = 2.0  # [m] never-seen cells count this close to seen ones; farther off there is no evidence, and none is used
+NEAR_SEEN = fusion.NEAR  # [m] never-seen cells count this close to seen ones; farther off no evidence is used
 
 
 class Predictions(NamedTuple):
@@ -55,13 +55,12 @@ def predict(
         temper: Temperatures.
         change: What is done to the inputs first, such as a camera that goes missing.
     """
-    parts, targets = [], []
+    parts = []
     for batch in batches:
         inputs = batch.inputs if change is None else change(batch.inputs)
-        parts.append(jax.device_get(_probabilities(spec, params, temper, inputs)))
-        targets.append(jax.tree.map(np.asarray, batch.targets))
-    path, flag, dead = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return Predictions(path, flag, dead, jax.tree.map(lambda *a: np.concatenate(a), *targets))
+        path, flag, dead = jax.device_get(_probabilities(spec, params, temper, inputs))
+        parts.append(Predictions(path, flag, dead, jax.tree.map(np.asarray, batch.targets)))
+    return joined(parts)
 
 
 def joined(parts: list[Predictions]) -> Predictions:
@@ -71,9 +70,9 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Predictions:
     """What the geometric rule says; of ways, what its verdict on the known map leaves open, unknown counting as free."""
-    path, flag, dead, targets = [], [], [], []
-    pose = np.zeros((1, 3))
+    parts, pose = [], np.zeros((1, 3))
     for batch in batches:
+        path, flag = [], []
         x = batch.inputs
         p = np.asarray(x.rule_p).astype(np.float32) / 255
         sure = np.asarray(x.rule_confidence).astype(np.float32) / 255
@@ -86,12 +85,11 @@ def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Prediction
             found = openings(floor, pose)
             path.append(found.open[0])
             flag.append(found.dead_end[0])
-        dead.append(np.round(p * sure * 65535).astype(np.uint16))
-        targets.append(jax.tree.map(np.asarray, batch.targets))
-    return Predictions(
-        np.asarray(path, np.float32), np.asarray(flag, np.float32), np.concatenate(dead),
-        jax.tree.map(lambda *a: np.concatenate(a), *targets),
-    )  # fmt: skip
+        parts.append(Predictions(
+            np.asarray(path, np.float32), np.asarray(flag, np.float32), np.round(p * sure * 65535).astype(np.uint16),
+            jax.tree.map(np.asarray, batch.targets),
+        ))  # fmt: skip
+    return joined(parts)
 
 
 def only(found: Predictions, frames: np.ndarray) -> Predictions:
@@ -108,6 +106,12 @@ def near_seen(visibility: np.ndarray, resolution: float) -> np.ndarray:
         if not unseen.all():
             found[k] = unseen & (np.asarray(ndimage.distance_transform_edt(unseen)) * resolution <= NEAR_SEEN)
     return found
+
+
+def evident(targets: Targets, resolution: float) -> np.ndarray:
+    """Cells that are judged, `[F, h, w]`: seen ones, and never-seen ones within `NEAR_SEEN` of them."""
+    seen = np.asarray(targets.visibility) != NEVER
+    return np.asarray(targets.valid) & (seen | near_seen(targets.visibility, resolution))
 
 
 def _of_ways(found: Predictions) -> dict[str, float]:
@@ -128,8 +132,8 @@ def _of_ways(found: Predictions) -> dict[str, float]:
 def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
     """Accuracy of ways, F1 of the flag, AUROC and AP of cells, interior AUROC, calibration errors; nan = undefined.
 
-    Cells are judged where there is evidence: seen ones, and never-seen ones within `NEAR_SEEN` of them (alone in
-    `cell_auroc_unseen`); `cell_auroc_everywhere` is over all that a label is defined for.
+    Cells are judged where there is evidence (`evident`), the never-seen ones of them alone in `cell_auroc_unseen`;
+    `cell_auroc_everywhere` is over all that a label is defined for.
 
     Args:
         found: From `predict` or `by_rule`.
@@ -141,9 +145,8 @@ def figures(found: Predictions, resolution: float = 0.2) -> dict[str, float]:
         names = ("cell_auroc", "cell_auroc_unseen", "cell_auroc_everywhere", "cell_ap", "interior_auroc", "ece")
         return out | dict.fromkeys(names, float("nan"))
     dead = found.dead.astype(np.float32) / 65535
-    unseen = near_seen(t.visibility, resolution) & t.valid
-    judged = unseen | (t.valid & (t.visibility != NEVER))
-    inner = judged & t.interior
+    judged = evident(t, resolution)
+    unseen, inner = judged & (t.visibility == NEVER), judged & t.interior
     return out | {
         "cell_auroc": metrics.auroc(dead[judged], t.dead_end[judged]),
         "cell_auroc_unseen": metrics.auroc(dead[unseen], t.dead_end[unseen]),
@@ -182,7 +185,7 @@ def intervals(
     cells = {}
     if found.dead is not None:
         step = (found.dead.astype(np.int64) * bins) >> 16
-        judged = t.valid & ((t.visibility != NEVER) | near_seen(t.visibility, resolution))
+        judged = evident(t, resolution)
         for name, mask in (("interior_auroc", t.interior & judged), ("cell_auroc", judged)):
             code = step + bins * t.dead_end
             cells[name] = np.stack([np.bincount(code[f][mask[f]], minlength=2 * bins) for f in frames])

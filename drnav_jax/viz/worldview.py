@@ -222,7 +222,7 @@ def _grids(row: Mapping[str, Any], predicted: bool) -> list[tuple[str, np.ndarra
     valid = np.asarray(row["valid"], bool)
     known = np.array(KNOWN)[np.asarray(row["local_map"])]
     truth = np.where(valid[..., None], np.array([0.82, 0.95, 0.84]), np.array([0.2, 0.2, 0.22]))
-    truth[~np.asarray(row["inside"], bool)] = (0.62, 0.64, 0.68)
+    truth[~np.asarray(row["inside"], bool)] = KNOWN[0]
     truth[valid & np.asarray(row["dead_end"], bool)] = (0.85, 0.25, 0.2)
     truth[valid & np.asarray(row["interior"], bool)] *= 0.72
     seen = np.array([[0.2, 0.55, 0.9], [0.65, 0.8, 0.95], [0.25, 0.25, 0.28]])[np.asarray(row["visibility"])]
