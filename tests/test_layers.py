@@ -46,7 +46,7 @@ SIDEWAYS = {
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400
 # Heavy or talkative, and needed by one subpackage each, which imports them when it is used.
-NOT_ON_IMPORT = ("mujoco", "rosbags", "matplotlib", "torch")
+NOT_ON_IMPORT = ("mujoco", "rosbags", "matplotlib", "torch", "numba")
 
 
 def modules(root: Path) -> dict[str, Path]:

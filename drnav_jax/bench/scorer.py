@@ -1,4 +1,4 @@
-"""The scoring kernel in the fields and at the places of a recorded drive: its rate, its error, and how it grows.
+"""The scoring kernel in the fields and at the places of a recorded drive: its rate and its error.
 
 One program of XLA's runs the kernel on one thread of a CPU; where threads share the candidates, the result says how many.
 """
@@ -21,10 +21,9 @@ from drnav_jax.types import GridMap, Observation
 
 NUM_STEPS = 56  # T
 THREADS = {4096: 1, 65536: 2}  # that share so many candidates
-COUNTS, LENGTHS = (1024, 4096, 16384, 65536), (14, 28, 56, 112)  # K and T of the scaling
 
 
-def _candidates(params: NavParams, seen: Observation, state: NavState, num: int) -> scoring.Candidates:
+def candidates(params: NavParams, seen: Observation, state: NavState, num: int) -> scoring.Candidates:
     """`num` candidates of a moving robot at a stop of a drive."""
     speeds = 16 if num <= 4096 else 64
     spec = GeneratorSpec(num_speeds=speeds, num_turns=(num - 256) // speeds, num_headings=256)
@@ -68,12 +67,12 @@ def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[st
         clear, words = field_of(drive.spec, drive.params, state)
         window = geometry.window_origin(state.belief.corner, drive.spec.filter.grid)
         value = GridMap(costmap.unpack(state.plan)[2], window, cell)
-        chosen = _candidates(drive.params, seen, state, 4096)
+        chosen = candidates(drive.params, seen, state, 4096)
         smooth = score((clear, GridMap(state.risk, window, cell), value), chosen, reader=BILINEAR)
         pairs.append((np.asarray(score(words, chosen).score, float), np.asarray(smooth.score, float)))
 
     words = field_of(drive.spec, drive.params, drive.stops[0][1])[1]
-    calls = [_scorer(words, _candidates(drive.params, *drive.stops[0], n), params, drive.params, n) for n in THREADS]
+    calls = [_scorer(words, candidates(drive.params, *drive.stops[0], n), params, drive.params, n) for n in THREADS]
     *seconds, reference = interleaved([*calls, matmul()], repeats)
     rates = {str(n): n * NUM_STEPS / s for n, s in zip(THREADS, seconds, strict=True)}
     return rates, _difference(pairs), 1e3 * reference
@@ -110,24 +109,4 @@ def _difference(pairs: list[tuple[np.ndarray, np.ndarray]]) -> dict[str, float]:
         "median_rank_of_choice": float(np.median([np.sum(smooth < best) for best, smooth in free])),
         "median_regret_m": float(np.median([best - smooth.min() for best, smooth in free])),
         "max_regret_m": float(np.max([best - smooth.min() for best, smooth in free])),
-    }
-
-
-def scaling(drive: Drive, repeats: int, counts: tuple[int, ...] = COUNTS, lengths: tuple[int, ...] = LENGTHS) -> dict:
-    """Times [ms] of the scoring kernel, on one thread: over K at T = `NUM_STEPS`, over T at K = 4,096."""
-    seen, state = drive.stops[0]
-    words = jax.jit(navigator.rollout_field, static_argnums=0)(drive.spec, drive.params, state)[1]
-
-    def call(num: int, steps: int) -> Callable[[], scoring.Scores]:
-        chosen = _candidates(drive.params, seen, state, num)
-        params = drive.params.score._replace(horizon=jnp.asarray(0.1 * steps, jnp.float32))
-        return lambda: scoring.score(words, chosen, params, drive.params.robot, dt=0.1, num_steps=steps)
-
-    spent = interleaved(
-        [*(call(num, NUM_STEPS) for num in counts), *(call(4096, steps) for steps in lengths)], repeats
-    )
-    times = [1e3 * s for s in spent]
-    return {
-        "candidates": dict(zip(map(str, counts), times[: len(counts)], strict=True)),
-        "steps": dict(zip(map(str, lengths), times[len(counts) :], strict=True)),
     }

@@ -6,38 +6,19 @@ the fusion network alone and in the tick (`network`), the LiDAR and the cameras 
 slow hour from slow code.
 """
 
-import platform
-import re
-from pathlib import Path
 from typing import Any
-
-import jax
 
 from drnav_jax.bench import mppi
 from drnav_jax.bench.camera import camera_against_mujoco
 from drnav_jax.bench.drive import STRIDE, record, tick_times
 from drnav_jax.bench.episodes import episode_rate
 from drnav_jax.bench.lidar import lidar_against_mujoco
+from drnav_jax.bench.machine import machine
 from drnav_jax.bench.network import network_times
 from drnav_jax.bench.physics import physics_rates
 from drnav_jax.bench.planner import plan_times, route_times
 from drnav_jax.bench.scorer import NUM_STEPS, THREADS, scoring_times
-from drnav_jax.bench.timing import cores
 from drnav_jax.sim.episode import EpisodeSpec
-
-
-def machine() -> dict[str, Any]:
-    """What this was measured on."""
-    info = Path("/proc/cpuinfo")
-    named = re.search(r"model name\s*:\s*(.*)", info.read_text() if info.exists() else "")
-    return {
-        "cores": cores(),
-        "cpu": named[1] if named else platform.processor() or platform.machine(),
-        "platform": platform.platform(),
-        "device": jax.default_backend(),
-        "jax": jax.__version__,
-        "python": platform.python_version(),
-    }
 
 
 def run(*, quick: bool = False) -> dict[str, Any]:
@@ -74,6 +55,25 @@ def run(*, quick: bool = False) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def mppi_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows of `table` about MPPI."""
+    bank, pairs, fresh = (found[f"{name}_ms"] for name in ("ours", "antithetic", "fresh"))
+    rows = [
+        (
+            f"MPPI, {found['samples']:,} x {found['steps']}",
+            f"{bank:.2f} ms with a bank of noise, {pairs:.2f} with antithetic pairs, {fresh:.2f} with fresh noise",
+        )
+    ]
+    for name in ("numpy", "numba"):
+        if name not in found["missing"]:
+            text = f"{found[f'{name}_ms']:.2f} ms with a bank ({found[f'{name}_ratio']:.1f} x ours)"
+            rows.append((f"  {name}", f"{text}, {found[f'{name}_fresh_ms']:.2f} fresh ({found[f'{name}_fresh_ratio']:.1f} x)"))
+    if "pytorch_mppi" not in found["missing"]:
+        over = f"{found['ratio']:.1f} x ours with a bank, {found['antithetic_ratio']:.1f} x with antithetic pairs"
+        rows.append(("  pytorch_mppi", f"{found['pytorch_mppi_ms']:.2f} ms ({over}, {found['fresh_ratio']:.1f} x fresh)"))
+    return rows + [(f"  {name}", f"not here: {why}") for name, why in found["missing"].items()]
+
+
 def table(result: dict[str, Any]) -> str:
     """The result of `run` for people."""
     tick, error, lidar, camera, physics, episodes = (
@@ -103,6 +103,7 @@ def table(result: dict[str, Any]) -> str:
             f"{result['cost_to_go_ms']:.1f} ms; {route['window']:.1f} on coarser cells, within "
             f"{100 * route['median_error']:.2f} % (median); {route['serpentine']:.1f} through a serpentine",
         ),
+        *mppi_rows(result["mppi"]),
         ("LiDAR 16x360, 100 obstacles", f"{lidar['rays_per_s'] / 1e6:.1f} M rays/s, {lidar['ratio']:.1f} x MuJoCo"),
         ("  against MuJoCo", f"max error {lidar['max_error_m']:.1e} m"),
         ("camera 96x96, 100 obstacles", f"{camera['images_per_s']:.0f} images/s, {rival}"),

@@ -10,10 +10,11 @@ from drnav_jax.bench.mppi.task import Task, Update, make
 from drnav_jax.bench.timing import cores, interleaved
 from drnav_jax.planning.noise import NoiseSpec
 
-THREADS = 2  # of each rival that can use several
+THREADS = (1, 2)  # of each rival that can use several; its better time counts
 BANK = 4  # sequences in a bank, over K
 ELSEWHERE = 1e-4  # relative difference of a sample's cost above which it has read another cell somewhere
-NOISES = {"ours": {"bank": BANK}, "antithetic": {"antithetic": True}, "fresh": {}}
+NOISES = ("ours", "antithetic", "fresh")  # of our commands: out of a bank, fresh pairs, fresh
+RIVALS = ("numpy", "numpy_fresh", "numba", "numba_fresh", "pytorch_mppi")
 EXTRA = "needs the extra: pip install drnav_jax[bench]"
 
 
@@ -21,15 +22,20 @@ def _updaters(task: Task, num_samples: int) -> tuple[dict[str, Callable[[np.ndar
     """Rivals by name, the controller of `pytorch_mppi` or None, and why those are missing that are."""
     found, missing, controller = {"numpy": in_numpy.updater(task)}, {}, None
     try:
-        found["numba"] = in_numba.updater(task, THREADS)
+        found["numba"] = in_numba.updater(task)
     except ImportError as error:
         missing["numba"] = f"{error}; {EXTRA}"
     try:
-        controller = in_torch.Controller(task, num_samples, THREADS)
+        controller = in_torch.Controller(task, num_samples)
         found["pytorch_mppi"] = controller.update
     except ImportError as error:
         missing["pytorch_mppi"] = f"{error}; {EXTRA}"
     return found, controller, missing
+
+
+def noise_of(name: str, num_samples: int) -> NoiseSpec:
+    """The noise of our command of this name, out of `NOISES`."""
+    return NoiseSpec(antithetic=name == "antithetic", bank=BANK * num_samples if name == "ours" else 0)
 
 
 def difference(one: Update, other: Update) -> dict[str, float]:
@@ -46,6 +52,41 @@ def difference(one: Update, other: Update) -> dict[str, float]:
     }  # fmt: skip
 
 
+def _rival_calls(
+    rivals: dict[str, Callable[[np.ndarray], Update]], controller: Any, num_samples: int, num_steps: int
+) -> dict[tuple[str, int], Callable[[], object]]:
+    """Commands of the rivals, by name (`RIVALS`) and number of threads."""
+    rng = np.random.default_rng(1)
+    bank = rng.standard_normal((num_steps, 2, BANK * num_samples), np.float32)
+
+    def banked() -> np.ndarray:
+        first = rng.integers(0, bank.shape[2] - num_samples + 1)
+        return np.ascontiguousarray(bank[:, :, first : first + num_samples])
+
+    def on(use: Callable[[int], None], num: int, command: Callable[[], object]) -> Callable[[], object]:
+        def call() -> object:
+            use(num)
+            return command()
+
+        return call
+
+    calls: dict[tuple[str, int], Callable[[], object]] = {}
+    for name in ("numpy", "numba"):
+        if name not in rivals:
+            continue
+        update = rivals[name]
+        both = {
+            name: lambda update=update: update(banked()),
+            f"{name}_fresh": lambda update=update: update(rng.standard_normal((num_steps, 2, num_samples), np.float32)),
+        }
+        threads = THREADS if name == "numba" else (1,)
+        use = in_numba.use_threads if name == "numba" else lambda num: None
+        calls |= {(key, num): on(use, num, command) for key, command in both.items() for num in threads}
+    if controller is not None:
+        calls |= {("pytorch_mppi", num): on(controller.use_threads, num, controller.command) for num in THREADS}
+    return calls
+
+
 def side_by_side(num_samples: int = 2000, num_steps: int = 56, repeats: int = 50) -> dict[str, Any]:
     """Times [ms] of one command, medians of interleaved repeats.
 
@@ -57,50 +98,31 @@ def side_by_side(num_samples: int = 2000, num_steps: int = 56, repeats: int = 50
     Returns:
         `ours_ms` (noise out of a bank), `antithetic_ms` (fresh pairs), `fresh_ms` (independent fresh normals);
         `pytorch_mppi_ms` (fresh, it has nothing else); `numpy_ms` and `numba_ms` (noise out of a bank), `numpy_fresh_ms`
-        and `numba_fresh_ms` (NumPy's generator). `ratio`, `antithetic_ratio`, `fresh_ratio`: how often ours fits into
-        `pytorch_mppi_ms`; `numba_ratio`, `numpy_ratio` and their `_fresh_` likewise for equal noise. `difference` of each
-        rival's answer from ours for the same noise (m/s and rad/s for controls), `missing`: why a rival has no figures
-        (None), `threads`, `samples`, `steps`.
+        and `numba_fresh_ms` (NumPy's generator); of each rival the time with as many threads as suit it best.
+        `ratio`, `antithetic_ratio`, `fresh_ratio`: how often ours fits into `pytorch_mppi_ms`; `numba_ratio`,
+        `numpy_ratio` and their `_fresh_` likewise for equal noise. `difference` of each rival's answer from ours for the
+        same noise, `missing`: why a rival has no figures (None), `by_threads`: the rivals' times by threads, `threads`:
+        those that XLA may use for ours, `samples`, `steps`.
     """
     task = make(num_steps)
-    rng = np.random.default_rng(1)
     rivals, controller, missing = _updaters(task, num_samples)
-    bank = rng.standard_normal((num_steps, 2, BANK * num_samples), np.float32)
-
-    def banked(update: Callable[[np.ndarray], Update]) -> Callable[[], Update]:
-        def call() -> Update:
-            first = rng.integers(0, bank.shape[2] - num_samples + 1)
-            return update(np.ascontiguousarray(bank[:, :, first : first + num_samples]))
-
-        return call
-
-    def fresh(update: Callable[[np.ndarray], Update]) -> Callable[[], Update]:
-        return lambda: update(rng.standard_normal((num_steps, 2, num_samples), np.float32))
-
-    calls: dict[str, Callable[[], object]] = {}
-    for name, how in NOISES.items():
-        noise = NoiseSpec(**(how | ({"bank": BANK * num_samples} if "bank" in how else {})))
-        calls[name] = ours.command(task, num_samples, noise)
-    for name in ("numpy", "numba"):
-        if name in rivals:
-            calls |= {name: banked(rivals[name]), f"{name}_fresh": fresh(rivals[name])}
-    if controller is not None:
-        calls["pytorch_mppi"] = controller.command
-    eps = rng.standard_normal((num_steps, 2, num_samples), np.float32)
+    eps = np.random.default_rng(2).standard_normal((num_steps, 2, num_samples), np.float32)
     expected = ours.update(task, eps)
     apart = {name: difference(update(eps), expected) for name, update in rivals.items()}
-    spent = dict(zip(calls, interleaved(list(calls.values()), repeats, rest=1e-3), strict=True))
-    ms = {name: 1e3 * spent[name] if name in spent else None for name in _NAMES}
-    over = lambda rival, own: ms[rival] / ms[own] if ms[rival] else None  # noqa: E731
+    theirs = _rival_calls(rivals, controller, num_samples, num_steps)
+    own = [ours.command(task, num_samples, noise_of(name, num_samples)) for name in NOISES]
+    spent = [1e3 * s for s in interleaved([*own, *theirs.values()], repeats, rest=1e-3)]
+    by_threads: dict[str, dict[str, float]] = {}
+    for (name, num), value in zip(theirs, spent[len(own) :], strict=True):
+        by_threads.setdefault(name, {})[str(num)] = value
+    ms = dict(zip(NOISES, spent, strict=False)) | {name: min(times.values()) for name, times in by_threads.items()}
+    over = lambda rival, own: ms[rival] / ms[own] if rival in ms else None  # noqa: E731
     return {
-        **{f"{name}_ms": value for name, value in ms.items()},
+        **{f"{name}_ms": ms.get(name) for name in (*NOISES, *RIVALS)},
         "ratio": over("pytorch_mppi", "ours"), "antithetic_ratio": over("pytorch_mppi", "antithetic"),
         "fresh_ratio": over("pytorch_mppi", "fresh"),
-        **{f"{n}_ratio": over(n, "ours") for n in ("numpy", "numba")},
-        **{f"{n}_fresh_ratio": over(f"{n}_fresh", "fresh") for n in ("numpy", "numba")},
-        "difference": apart, "missing": missing, "samples": num_samples, "steps": num_steps,
-        "threads": {"ours": cores(), "pytorch_mppi": THREADS, "numba": THREADS, "numpy": 1},
+        **{f"{name}_ratio": over(name, "ours") for name in ("numpy", "numba")},
+        **{f"{name}_fresh_ratio": over(f"{name}_fresh", "fresh") for name in ("numpy", "numba")},
+        "difference": apart, "missing": missing, "by_threads": by_threads, "threads": cores(),
+        "samples": num_samples, "steps": num_steps,
     }  # fmt: skip
-
-
-_NAMES = (*NOISES, "numpy", "numpy_fresh", "numba", "numba_fresh", "pytorch_mppi")

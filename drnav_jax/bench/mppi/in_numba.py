@@ -8,19 +8,20 @@ import numpy as np
 from drnav_jax.bench.mppi.task import Task, Update, weighted
 
 
-def updater(task: Task, threads: int) -> Callable[[np.ndarray], Update]:
-    """A function from the noise `[T, 2, K]` to the update.
+def use_threads(num: int) -> None:
+    """Let that many threads share the samples, as far as there are processors."""
+    import numba  # pyright: ignore[reportMissingImports]
 
-    Args:
-        task: What to do.
-        threads: That share the samples, as far as there are processors.
+    numba.set_num_threads(min(num, numba.config.NUMBA_NUM_THREADS))
+
+
+def updater(task: Task) -> Callable[[np.ndarray], Update]:
+    """A function from the noise `[T, 2, K]` to the update.
 
     Raises:
         ImportError: If Numba is not installed.
     """
     import numba  # pyright: ignore[reportMissingImports]
-
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
     # sums and products may be reordered; nothing here is infinite or NaN
     @numba.njit(parallel=True, fastmath=True)

@@ -18,18 +18,16 @@ class Controller:
     Args:
         task: What to do.
         num_samples: K.
-        threads: Of torch, in the whole process.
 
     Raises:
         ImportError: If torch or pytorch_mppi is not installed.
     """
 
-    def __init__(self, task: Task, num_samples: int, threads: int) -> None:
+    def __init__(self, task: Task, num_samples: int) -> None:
         """Make the controller."""
         import pytorch_mppi  # pyright: ignore[reportMissingImports]
         import torch  # pyright: ignore[reportMissingImports]
 
-        torch.set_num_threads(threads)
         tensor: Callable[[Any], Any] = lambda a: torch.tensor(np.asarray(a, np.float32))  # noqa: E731
         height, width = task.cost.shape
         per_cell, dt = 1.0 / task.resolution, task.dt
@@ -56,6 +54,10 @@ class Controller:
             lambda_=task.temperature, U_init=self._control.clone(),
         )  # fmt: skip
         self._sample = self._mppi._sample_noise
+
+    def use_threads(self, num: int) -> None:
+        """Let torch use that many threads, in the whole process."""
+        self._torch.set_num_threads(num)
 
     def command(self) -> Any:
         """One command from the task's controls, with fresh noise; the controls `[T, 2]` (tensor)."""

@@ -1,12 +1,13 @@
 """The task by `drnav_jax.planning.mppi`: whole commands, with noise of any kind."""
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PRNGKeyArray
 
 from drnav_jax.bench.mppi.task import Task, Update
 from drnav_jax.planning import mppi, mppi_critics, mppi_rollout
@@ -86,18 +87,22 @@ def update(task: Task, eps: np.ndarray) -> Update:
     return Update(np.asarray(control), np.asarray(priced.total))
 
 
-def command(task: Task, num_samples: int, noise: NoiseSpec) -> Callable[[], Array]:
-    """A function that gives the next command's controls `[T, 2]`, from the task's, with other noise at each call."""
+def planner(task: Task, num_samples: int, noise: NoiseSpec) -> tuple[Callable[..., Array], tuple]:
+    """A function (ready, state, key) -> the next command's controls `[T, 2]`, to be compiled, and its first two arguments."""
     ready, spec = prepare(task), _spec(task, num_samples, noise)
     state = mppi.init(spec, ready.params, jax.random.key(0))._replace(control=ready.control)
-    keys = list(jax.random.split(jax.random.key(1), 64))
-    turn = iter(range(1 << 62))
 
-    def call() -> Array:
+    def plan(ready: Prepared, state: mppi.MppiState, key: PRNGKeyArray) -> Array:
         after, _, _ = mppi.plan(
-            spec, ready.params, ready.limits, COST, ready.scene, state, ready.pose, ready.twist,
-            keys[next(turn) % len(keys)],
-        )  # fmt: skip
+            spec, ready.params, ready.limits, COST, ready.scene, state, ready.pose, ready.twist, key
+        )
         return after.control
 
-    return call
+    return plan, (ready, state)
+
+
+def command(task: Task, num_samples: int, noise: NoiseSpec) -> Callable[[], Array]:
+    """A function that gives the next command's controls `[T, 2]`, from the task's, with other noise at each call."""
+    plan, given = planner(task, num_samples, noise)
+    program, keys = jax.jit(plan), itertools.cycle(jax.random.split(jax.random.key(1), 64))
+    return lambda: program(*given, next(keys))

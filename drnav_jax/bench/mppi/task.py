@@ -86,7 +86,7 @@ def make(num_steps: int = 56, seed: int = 0, size: int = 256, resolution: float 
     """
     rng = np.random.default_rng(seed)
     occupied = np.zeros((size, size), bool)
-    for row, col in rng.integers(0, size - 8, (size // 6, 2)):
+    for row, col in rng.integers(0, size - 8, (size * size // 1500, 2)):
         occupied[row : row + 8, col : col + 8] = True
     middle, free = size // 2, int(0.6 / resolution)
     occupied[middle - free : middle + free, middle - free : middle + free] = False
