@@ -68,7 +68,8 @@ def native_views(spec: RigSpec, world: World, rig: CameraRig, poses: np.ndarray,
             vertical=vertical, shape=spec.shape, repeats=repeats,
         )  # fmt: skip
         for gl in GL:
-            program = "import sys; from drnav_jax.bench.camera import draw_natively; draw_natively(sys.argv[1])"
+            # mujoco first: where this way to draw is missing it says so before anything else is loaded
+            program = "import sys, mujoco; from drnav_jax.bench.camera import draw_natively; draw_natively(sys.argv[1])"
             path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
             done = subprocess.run(
                 [sys.executable, "-c", program, folder], capture_output=True, text=True, check=False,

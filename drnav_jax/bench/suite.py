@@ -34,7 +34,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
-    drive = record(2 * STRIDE if quick else warm_up + 200)
+    drive = record(STRIDE if quick else warm_up + 200)
     seeing = network_times(drive, warm_up, 3 if quick else 100)
     rates, error, reference = scoring_times(drive, 3 if quick else 50)
     lidar = lidar_against_mujoco(repeats=3 if quick else 30)

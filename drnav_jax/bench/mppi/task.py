@@ -14,6 +14,7 @@ here represents exactly, and are read at the cell under the robot's centre.
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
@@ -90,7 +91,7 @@ def make(num_steps: int = 56, seed: int = 0, size: int = 256, resolution: float 
         occupied[row : row + 8, col : col + 8] = True
     middle, free = size // 2, int(0.6 / resolution)
     occupied[middle - free : middle + free, middle - free : middle + free] = False
-    distance = np.asarray(ndimage.distance_transform_edt(~occupied) * resolution, np.float32)
+    distance = jnp.asarray(ndimage.distance_transform_edt(~occupied) * resolution, jnp.float32)
     cost = np.asarray(costmap.inflation(distance, RADIUS, InflationParams()), np.float32)
     centre = (np.arange(size) + 0.5) * resolution - 0.5 * size * resolution
     risk = np.exp(-(np.square(centre - 1.0)[:, None] + np.square(centre - 0.8)[None, :]))
