@@ -1,7 +1,7 @@
 """How times and memory grow: over candidates, steps, robots and the size of the map (`drnav bench --scaling`).
 
-Every point is one program, timed in turn with the others of its curve. Memory is what the program needs beside its arguments
-and results, as XLA planned it. A curve's exponent is the slope of log time over log size: 1 is linear, 0 does not grow.
+Every point is one program, timed in turn with the others of its curve. Memory is what the program needs beside its
+arguments and results, as XLA planned it. A curve's exponent is the slope of log time over log size: 1 is linear, 0 does not grow.
 """
 
 import json
@@ -90,7 +90,8 @@ def _route(edge: int) -> tuple[Callable[[], Any], float]:
     cost = np.where(closed, grids.UNREACHABLE, 1.0 + task.cost / 254.0).astype(np.float32)
     initial = np.full_like(cost, grids.UNREACHABLE)
     initial[0, 0] = 0.0
-    return _program(lambda c, i: grids.cost_to_go(c, i, resolution=task.resolution), jnp.asarray(cost), jnp.asarray(initial))
+    solve = lambda cost, initial: grids.cost_to_go(cost, initial, resolution=task.resolution)  # noqa: E731
+    return _program(solve, jnp.asarray(cost), jnp.asarray(initial))
 
 
 def measure(*, quick: bool = False) -> dict[str, Any]:

@@ -50,8 +50,8 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         "tick_lidar_ms": tick_times(drive, warm_up), "network_ms": seeing["network"]["median"],
         "network": seeing["network"], "tick_fusion_ms": seeing["tick_fusion"], "scoring": rates, "scoring_error": error,
         "plan_ms": planning["plan"]["both"], "cost_to_go_ms": planning["cost_to_go"]["full"], "planning": planning,
-        "mppi": rivals, "lidar": lidar, "camera": camera, "mjx": physics, "episodes_per_s": per_second, "episodes": episodes,
-        "reference_matmul_ms": reference, "machine": machine(),
+        "mppi": rivals, "lidar": lidar, "camera": camera, "mjx": physics, "episodes_per_s": per_second,
+        "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
     }  # fmt: skip
 
 
@@ -66,8 +66,9 @@ def mppi_rows(found: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     for name in ("numpy", "numba"):
         if name not in found["missing"]:
-            text = f"{found[f'{name}_ms']:.2f} ms with a bank ({found[f'{name}_ratio']:.1f} x ours)"
-            rows.append((f"  {name}", f"{text}, {found[f'{name}_fresh_ms']:.2f} fresh ({found[f'{name}_fresh_ratio']:.1f} x)"))
+            ms, over = ([found[f"{name}{kind}_{what}"] for kind in ("", "_fresh")] for what in ("ms", "ratio"))
+            text = f"{ms[0]:.2f} ms with a bank ({over[0]:.1f} x ours), {ms[1]:.2f} fresh ({over[1]:.1f} x)"
+            rows.append((f"  {name}", text))
     if "pytorch_mppi" not in found["missing"]:
         over = f"{found['ratio']:.1f} x ours with a bank, {found['antithetic_ratio']:.1f} x with antithetic pairs"
         rows.append(("  pytorch_mppi", f"{found['pytorch_mppi_ms']:.2f} ms ({over}, {found['fresh_ratio']:.1f} x fresh)"))

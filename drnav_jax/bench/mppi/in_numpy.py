@@ -1,4 +1,4 @@
-"""The task in NumPy, over all samples and, but for the limited accelerations, over all steps at once; its functions use one thread."""
+"""The task in NumPy, over all samples and, but for the limited accelerations, all steps at once, on one thread."""
 
 from collections.abc import Callable
 

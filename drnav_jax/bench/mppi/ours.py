@@ -88,7 +88,7 @@ def update(task: Task, eps: np.ndarray) -> Update:
 
 
 def planner(task: Task, num_samples: int, noise: NoiseSpec) -> tuple[Callable[..., Array], tuple]:
-    """A function (ready, state, key) -> the next command's controls `[T, 2]`, to be compiled, and its first two arguments."""
+    """A function (ready, state, key) -> the next controls `[T, 2]`, to be compiled, and its first two arguments."""
     ready, spec = prepare(task), _spec(task, num_samples, noise)
     state = mppi.init(spec, ready.params, jax.random.key(0))._replace(control=ready.control)
 
