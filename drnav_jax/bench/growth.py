@@ -1,7 +1,8 @@
 """How times and memory grow: over candidates, steps, robots and the size of the map (`drnav bench --scaling`).
 
 Every point is one program, timed in turn with the others of its curve. Memory is what the program needs beside its
-arguments and results, as XLA planned it. A curve's exponent is the slope of log time over log size: 1 is linear, 0 does not grow.
+arguments and results, as XLA planned it. A curve's exponent is the slope of log time over log size: 1 is linear, 0 does
+not grow.
 """
 
 import json
