@@ -1,5 +1,6 @@
 """The task in Numba: one loop over the samples, shared by threads, that keeps each robot in registers. Extra `bench`."""
 
+import inspect
 import math
 from collections.abc import Callable
 
@@ -23,9 +24,7 @@ def updater(task: Task) -> Callable[[np.ndarray], Update]:
     """
     import numba  # pyright: ignore[reportMissingImports]
 
-    # sums and products may be reordered; nothing here is infinite or NaN
-    @numba.njit(parallel=True, fastmath=True)
-    def roll(eps, control, sigma, reach, twist, pose, goal, layers, height, width, per_cell, dt):  # noqa: ANN
+    def roll(eps, control, sigma, reach, twist, pose, goal, layers, height, width, per_cell, dt):
         num_steps, _, num = eps.shape
         running = np.empty(num, np.float32)
         for k in numba.prange(num):
@@ -46,6 +45,9 @@ def updater(task: Task) -> Callable[[np.ndarray], Update]:
             running[k] = total
         return running
 
+    # unwrapped: under a shape-checking import hook (jaxtyping's) it is not a plain function, and Numba reads no other.
+    # Fast: sums and products may be reordered, and nothing here is infinite or NaN.
+    program = numba.njit(parallel=True, fastmath=True)(inspect.unwrap(roll))
     height, width = task.cost.shape
     pose = (np.float32(task.pose[0] - task.origin[0]), np.float32(task.pose[1] - task.origin[1]), task.pose[2])
     given = (
@@ -54,7 +56,7 @@ def updater(task: Task) -> Callable[[np.ndarray], Update]:
     )  # fmt: skip
 
     def update(eps: np.ndarray) -> Update:
-        running = roll(eps, *given)
+        running = program(eps, *given)
         return Update(weighted(task, eps, running), running)
 
     return update
