@@ -25,7 +25,7 @@ import numpy as np
 import tyro
 
 from drnav_jax import dataset, report, viz, worlds
-from drnav_jax.bench_network import latency
+from drnav_jax.bench.network import latency
 from drnav_jax.models import clip, network, views, vlm, weights
 from drnav_jax.models.batch import NOW, Batch, batch_of
 from drnav_jax.sim.lidar import LidarSpec

@@ -266,6 +266,15 @@ def test_bench_prints_what_it_measures(capsys, monkeypatch):
     assert out.splitlines() == ["episodes_per_s: 2.5", "machine", "  quick: False"]
 
 
+def test_bench_writes_how_things_grow(capsys, monkeypatch):
+    curve = {"over": "things", "sizes": [1, 2], "ms": [1.0, 2.0], "mb": [0.5, 0.5], "exponent": 1.0}
+    found = {"curves": {"a part": curve}, "machine": {"cores": 2, "cpu": "a processor", "jax": "0.10"}}
+    monkeypatch.setattr(cli.growth, "measure", lambda quick=False: found)
+    code, out, err = call(capsys, "bench", "--scaling", "grown", "--json")
+    assert (code, err) == (0, "drnav: wrote grown/\n") and json.loads(out) == found
+    assert "| a part | things |" in Path("grown/scaling.md").read_text() and Path("grown/scaling.png").is_file()
+
+
 @pytest.mark.slow
 def test_both_physics_agree_in_open_space(capsys):
     records = {}

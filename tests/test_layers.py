@@ -25,10 +25,6 @@ RANKS = {
     "gallery": 3,
     "train": 3,
     "bench": 3,
-    "bench_sensors": 3,
-    "bench_planning": 3,
-    "bench_physics": 3,
-    "bench_network": 3,
     "report": 3,
     "sources": 3,
     "navigator": 2,
@@ -45,15 +41,12 @@ RANKS = {
     "grids": 0,
 }
 SIDEWAYS = {
-    ("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"), ("bench", "bench_sensors"),
-    ("bench", "bench_planning"), ("bench", "bench_physics"), ("bench_planning", "evaluate"),
-    ("bench_planning", "bench_sensors"), ("bench_physics", "bench_sensors"),
-    ("bench", "bench_network"), ("bench_network", "bench_planning"),
+    ("sim", "worlds"), ("geometry", "types"), ("grids", "types"), ("bench", "evaluate"),
 }  # fmt: skip
 BANNED_NAMES = {"utils", "helpers", "common", "misc"}
 MAX_LINES = 400
 # Heavy or talkative, and needed by one subpackage each, which imports them when it is used.
-NOT_ON_IMPORT = ("mujoco", "rosbags", "matplotlib", "torch")
+NOT_ON_IMPORT = ("mujoco", "rosbags", "matplotlib", "torch", "numba")
 
 
 def modules(root: Path) -> dict[str, Path]:

@@ -3,16 +3,24 @@
 import sys
 
 from drnav_jax import __version__, bench, report
+from drnav_jax.bench import growth
 from drnav_jax.cli import data, drive, learn, process
 from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Train, Trial, Worlds, parse
 from drnav_jax.cli.terminal import INTERRUPTED, stdout_kept
+from drnav_jax.viz import MissingExtra
 
 __all__ = ["Bench", "Command", "Compare", "Dataset", "Run", "Train", "Trial", "Worlds", "main", "parse"]
 
 
 def _measure(args: Bench) -> int:
     with stdout_kept(args.json):
-        result = bench.run(quick=args.quick)
+        result = bench.run(quick=args.quick) if args.scaling is None else growth.measure(quick=args.quick)
+    if args.scaling is not None:
+        try:
+            growth.write(args.scaling, result)
+        except MissingExtra as error:
+            print(f"drnav: no picture: {error}", file=sys.stderr)
+        print(f"drnav: wrote {args.scaling}/", file=sys.stderr)
     print(report.dumps(result) if args.json else report.outline(result))
     return 0
 

@@ -108,10 +108,13 @@ class Bench:
 
     Attributes:
         quick: Fewer repeats: a minute, rougher figures.
+        scaling: Measure instead how times and memory grow over candidates, steps, robots and maps; folder for the table and
+            the plot.
         json: Print one JSON object on stdout, and nothing else there.
     """
 
     quick: bool = False
+    scaling: Annotated[Path | None, _flag("DIR", "")] = None
     json: bool = False
 
 

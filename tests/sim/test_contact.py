@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax import bench_sensors as bench
+from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax import sim
 from drnav_jax.worlds.world import HEADROOM, World, from_grid, make_world, rasterise, stack_worlds
 
@@ -31,7 +31,7 @@ def outlines(world: World) -> np.ndarray:
 
 
 def test_boxes_and_cylinders():
-    world = bench.random_obstacles(0, 16, extent=6.0)
+    world = random_obstacles(0, 16, extent=6.0)
     surface = outlines(world)
     points = np.random.default_rng(0).uniform(-6, 6, (300, 2)).astype(np.float32)
     here = jax.tree.map(jnp.asarray, world)
@@ -76,7 +76,7 @@ def test_nothing_near():
 
 
 def test_padding_does_not_count_and_a_batch_compiles_once():
-    worlds = [bench.random_obstacles(seed, n) for seed, n in ((0, 3), (1, 12))]
+    worlds = [random_obstacles(seed, n) for seed, n in ((0, 3), (1, 12))]
     batch = jax.tree.map(jnp.asarray, stack_worlds(worlds))
 
     @jax.jit

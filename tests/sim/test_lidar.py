@@ -8,7 +8,8 @@ import pytest
 from reference_rays import MARCH, trace
 from scipy import stats
 
-from drnav_jax import bench_sensors as bench
+from drnav_jax.bench.lidar import lidar_against_mujoco, native_lidar
+from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax import sim
 from drnav_jax.sim.lidar import HIT_MARGIN
 from drnav_jax.worlds.materials import EXTINCTION, Material
@@ -44,13 +45,13 @@ def same(a: np.ndarray, b: np.ndarray, tolerance: float) -> bool:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_ranges_are_those_of_native_mujoco(seed):
-    result = bench.lidar_against_mujoco(seed, repeats=1)
+    result = lidar_against_mujoco(seed, repeats=1)
     assert result["mismatches"] == 0
     assert result["max_error_m"] < MAX_ERROR
 
 
 def test_ranges_are_those_of_native_mujoco_in_many_worlds():
-    results = [bench.lidar_against_mujoco(seed, repeats=1) for seed in range(100, 150)]
+    results = [lidar_against_mujoco(seed, repeats=1) for seed in range(100, 150)]
     assert sum(r["mismatches"] for r in results) == 0
     assert max(r["max_error_m"] for r in results) < MAX_ERROR
 
@@ -71,7 +72,7 @@ def test_ranges_are_those_of_native_mujoco_in_many_worlds():
 def test_a_sensor_in_or_over_an_obstacle_sees_what_mujoco_sees(boxes, cylinders):
     spec = sim.LidarSpec(rings=24, azimuths=90, elevation_min=-1.2, elevation_max=1.2)
     pose, world = np.asarray([0.1, 0.05, 0.6], np.float32), world_of(boxes, cylinders)
-    native = bench.native_lidar(spec, sim.LidarParams(max_range=100.0), world, pose)()
+    native = native_lidar(spec, sim.LidarParams(max_range=100.0), world, pose)()
     assert same(cast(spec, world, pose, max_range=100.0), native, MAX_ERROR)
 
 
@@ -109,7 +110,7 @@ def test_a_wall_of_a_grid_map_is_met_below_its_height_and_passed_over_above():
 
 
 def test_padding_is_never_met():
-    worlds = [bench.random_obstacles(seed, n) for seed, n in ((0, 3), (1, 12))]
+    worlds = [random_obstacles(seed, n) for seed, n in ((0, 3), (1, 12))]
     batch = jax.tree.map(jnp.asarray, stack_worlds(worlds))
     pose = jnp.asarray(ORIGIN)
     params = sim.LidarParams(max_range=1e7)  # would reach the padding
@@ -120,7 +121,7 @@ def test_padding_is_never_met():
 
 def test_points_lie_where_the_rays_meet_ring_by_ring():
     spec = sim.LidarSpec(rings=4, azimuths=7, elevation_min=-0.3, elevation_max=0.2)
-    world, pose = bench.random_obstacles(3, 40), np.asarray([0.3, 0.1, 2.0], np.float32)
+    world, pose = random_obstacles(3, 40), np.asarray([0.3, 0.1, 2.0], np.float32)
     points, valid = scan(spec, world, pose, noise_std=0.0, dropout=0.0)
     ranges = cast(spec, world, pose)
     assert points.shape == (28, 3) and valid.shape == (28,) and valid.all()
@@ -289,7 +290,7 @@ def test_a_ceiling_is_met_and_one_ring_or_many_do():
 
 
 def test_vmap_is_a_loop():
-    world = jax.tree.map(jnp.asarray, bench.random_obstacles(5, 20))
+    world = jax.tree.map(jnp.asarray, random_obstacles(5, 20))
     poses = jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (4, 3)), jnp.float32)
     keys = jax.random.split(jax.random.key(0), 4)
     params = sim.LidarParams()
@@ -301,7 +302,7 @@ def test_vmap_is_a_loop():
 
 
 def test_a_sweep_compiles_once():
-    world = jax.tree.map(jnp.asarray, bench.random_obstacles(5, 20))
+    world = jax.tree.map(jnp.asarray, random_obstacles(5, 20))
 
     @jax.jit
     @chex.assert_max_traces(n=1)

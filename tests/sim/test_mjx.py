@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drnav_jax import worlds
-from drnav_jax.bench_sensors import random_obstacles
+from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax.sim import episode, mjx
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.lidar import LidarParams, LidarSpec

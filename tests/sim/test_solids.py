@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drnav_jax import worlds
-from drnav_jax.bench_sensors import random_obstacles
+from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax.sim import solids
 from drnav_jax.worlds import Material, make_world, signed_distance, stack_worlds, surfaces
 

@@ -1,17 +1,15 @@
-"""The sensors next to native MuJoCo: the same rays and the same views, in turn within one run.
+"""The cameras next to native MuJoCo: the same views, in turn within one run.
 
 MuJoCo's renderer needs OpenGL without a screen (the system package libegl1 or libosmesa6) and takes the choice from the
 environment when it is imported; so it runs in a process of its own, and where it cannot, that says why.
 """
 
-import importlib
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,141 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax.sim import CameraParams, LidarParams, LidarSpec, cast, render
+from drnav_jax.bench.obstacles import native_scene, random_obstacles
+from drnav_jax.bench.timing import interleaved, matmul
+from drnav_jax.sim import CameraParams, render
 from drnav_jax.types import CameraRig, RigSpec, rig_of
 from drnav_jax.worlds.world import World, make_world
 
 GL = ("egl", "osmesa")  # ways to draw without a screen, tried in turn
-
-
-def interleaved(calls: list[Callable[[], object]], repeats: int) -> list[float]:
-    """Median time [s] of each call; the calls take turns, so that a slow moment hits them all."""
-    times: list[list[float]] = [[] for _ in calls]
-    for k in range(repeats + 1):
-        for call, spent in zip(calls, times, strict=True):
-            start = time.perf_counter()
-            jax.block_until_ready(call())
-            if k:  # the first round warms up
-                spent.append(time.perf_counter() - start)
-    return [statistics.median(spent) for spent in times]
-
-
-def random_obstacles(seed: int, num_obstacles: int, extent: float = 20.0, gap: float = 0.5) -> World:
-    """A world of boxes at all angles and cylinders, half of each, around a free origin.
-
-    Args:
-        seed: Of the world.
-        num_obstacles: How many in all.
-        extent: Half the edge of the square that they fill [m].
-        gap: Free distance around the origin [m].
-    """
-    rng = np.random.default_rng(seed)
-    num_boxes = num_obstacles // 2
-    half = rng.uniform(0.1, 1.5, (num_obstacles, 2))
-    radius = np.where(np.arange(num_obstacles) < num_boxes, np.hypot(*half.T), half[:, 0])
-    centre = rng.uniform(-extent, extent, (num_obstacles, 2))
-    near = np.hypot(*centre.T) < radius + gap
-    centre[near] *= ((radius + gap + extent / 2) / np.hypot(*centre.T))[near, None]
-    low = np.where(rng.random(num_obstacles) < 0.25, rng.uniform(0.0, 1.0, num_obstacles), 0.0)
-    z = np.stack([low, low + rng.uniform(0.2, 2.5, num_obstacles)], axis=1)
-    yaw = rng.uniform(-np.pi, np.pi, (num_obstacles, 1))
-    boxes = np.concatenate([centre, yaw, half, z], axis=1)[:num_boxes]
-    cylinders = np.concatenate([centre, half[:, :1], z], axis=1)[num_boxes:]
-    return jax.tree.map(jnp.asarray, make_world(boxes, cylinders))
-
-
-def native_scene(world: World) -> tuple[Any, Any]:
-    """The module `mujoco`, and an `MjSpec` with the ground (geom 0), the boxes and the cylinders of a world."""
-    # Imported when it is used, and by name: pyright does not see into its C++ module.
-    mujoco: Any = importlib.import_module("mujoco")
-    scene = mujoco.MjSpec()
-    scene.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[200, 200, 1])
-    for x, y, yaw, half_x, half_y, low, high in np.asarray(world.boxes, float):
-        scene.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[x, y, (low + high) / 2],
-            size=[half_x, half_y, (high - low) / 2],
-            quat=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)],
-        )
-    for x, y, radius, low, high in np.asarray(world.cylinders, float):
-        scene.worldbody.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-            pos=[x, y, (low + high) / 2],
-            size=[radius, (high - low) / 2, 0],
-        )
-    return mujoco, scene
-
-
-def native_lidar(spec: LidarSpec, params: LidarParams, world: World, pose: np.ndarray) -> Callable[[], np.ndarray]:
-    """The rays of `sim.cast` in native MuJoCo (`mj_multiRay`), ready to be cast again and again.
-
-    Args:
-        spec: The beams.
-        params: Range and mounting height.
-        world: Boxes and cylinders; a field is not looked at.
-        pose: x, y, yaw of `base_link` [m, rad].
-
-    Returns:
-        A function that casts all rays and returns ranges [m], `[rings, azimuths]`; inf where
-        nothing is met. The array is the same at each call.
-    """
-    mujoco, scene = native_scene(world)
-    model = scene.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-
-    e, a = np.meshgrid(spec.elevations, spec.bearings + float(pose[2]), indexing="ij")
-    rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1).reshape(-1)
-    sensor = np.asarray([pose[0], pose[1], params.height], float)
-    limit = float(params.max_range)
-    met, ranges = np.zeros(spec.num_points, np.int32), np.zeros(spec.num_points)
-
-    def cast_native() -> np.ndarray:
-        mujoco.mj_multiRay(model, data, sensor, rays, None, 1, -1, met, ranges, None, spec.num_points, limit)
-        ranges[met < 0] = np.inf
-        return ranges.reshape(spec.rings, spec.azimuths)
-
-    return cast_native
-
-
-def lidar_against_mujoco(
-    seed: int = 0, num_obstacles: int = 100, rings: int = 16, azimuths: int = 360, repeats: int = 30
-) -> dict[str, float]:
-    """Our LiDAR and native `mj_multiRay` on the same rays, world and pose.
-
-    The native one runs on the calling thread, as it comes; ours on what XLA uses.
-
-    Args:
-        seed: Of the world.
-        num_obstacles: Boxes and cylinders.
-        rings: Rays stacked in elevation.
-        azimuths: Rays in one turn.
-        repeats: How often each is timed.
-
-    Returns:
-        `rays_per_s` and `mujoco_rays_per_s` (medians), their `ratio`, the largest difference
-        between ranges `max_error_m`, and `mismatches`, rays that met something in one only.
-    """
-    world = random_obstacles(seed, num_obstacles)
-    spec = LidarSpec(rings, azimuths)
-    params = LidarParams(max_range=100.0)
-    pose = np.asarray([0.1, -0.2, np.random.default_rng(seed).uniform(-np.pi, np.pi)], np.float32)
-    native = native_lidar(spec, params, world, pose)
-    on_device = jax.tree.map(jnp.asarray, (params, world, pose))
-
-    def ours() -> jax.Array:
-        return cast(spec, *on_device)
-
-    seconds, native_seconds = interleaved([ours, native], repeats)
-    ranges, expected = np.asarray(ours(), float), native()
-    both = np.isfinite(ranges) & np.isfinite(expected)
-    return {
-        "rays_per_s": spec.num_points / seconds,
-        "mujoco_rays_per_s": spec.num_points / native_seconds,
-        "ratio": native_seconds / seconds,
-        "max_error_m": float(np.max(np.abs(ranges[both] - expected[both]), initial=0.0)),
-        "mismatches": float(np.sum(np.isfinite(ranges) != np.isfinite(expected))),
-    }
 
 
 class NativeViews(NamedTuple):
@@ -190,7 +60,7 @@ def native_views(spec: RigSpec, world: World, rig: CameraRig, poses: np.ndarray,
     cameras = [_world_cameras(rig, pose) for pose in np.asarray(poses, float)]
     position, rotation = (np.concatenate(part) for part in zip(*cameras, strict=True))
     vertical = 2 * np.degrees(np.arctan(spec.shape[0] / 2 / float(rig.focal[0, 1])))
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
     failures = []
     with tempfile.TemporaryDirectory() as folder:
         np.savez(
@@ -198,7 +68,8 @@ def native_views(spec: RigSpec, world: World, rig: CameraRig, poses: np.ndarray,
             vertical=vertical, shape=spec.shape, repeats=repeats,
         )  # fmt: skip
         for gl in GL:
-            program = "import sys; from drnav_jax.bench_sensors import draw_natively; draw_natively(sys.argv[1])"
+            # mujoco first: where this way to draw is missing it says so before anything else is loaded
+            program = "import sys, mujoco; from drnav_jax.bench.camera import draw_natively; draw_natively(sys.argv[1])"
             path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
             done = subprocess.run(
                 [sys.executable, "-c", program, folder], capture_output=True, text=True, check=False,
@@ -273,14 +144,12 @@ def camera_against_mujoco(
     keys = jax.random.split(jax.random.key(seed), num_poses)
     shares = [(jnp.asarray(poses[k::workers]), keys[k::workers]) for k in range(workers)]
     frames = jax.jit(lambda poses, keys: jax.lax.map(lambda at: render(spec, params, world, rig, *at), (poses, keys)))
-    square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
-    matmul = jax.jit(lambda a: a @ a)
     with ThreadPoolExecutor(workers) as pool:
 
         def ours() -> list[jax.Array]:
             return list(pool.map(lambda share: jax.block_until_ready(frames(*share)), shares))
 
-        seconds, reference = interleaved([ours, lambda: matmul(square)], repeats)
+        seconds, reference = interleaved([ours, matmul()], repeats)
     rate = num_poses * len(spec.mounts) / seconds
     native, reason = None, None
     try:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax.bench_sensors import interleaved
+from drnav_jax.bench.timing import interleaved, matmul
 from drnav_jax.sim import contact, kinematic, mjx
 from drnav_jax.sim.kinematic import FaultParams
 from drnav_jax.sim.mjx import MjxParams, MjxSpec
@@ -109,11 +109,9 @@ def physics_rates(
 
     mujoco, model, data = native(spec, every[0])
     data.qpos[:], data.ctrl[:] = starts[0], (0.8, 0.0, 0.3)
-    square = jax.random.normal(jax.random.key(0), (1024, 1024), jnp.float32)
-    matmul = jax.jit(lambda a: a @ a)
     calls: list[Callable[[], object]] = [
         ours, lambda: slide(poses, jnp.zeros((batch, 2), jnp.float32)), lambda: mujoco.mj_step(model, data, nstep=steps),
-        lambda: matmul(square),
+        matmul(),
     ]  # fmt: skip
     seconds, kinematic_s, native_s, reference = interleaved(calls, repeats)
     return {

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from drnav_jax import navigator, worlds
-from drnav_jax.bench_planning import DRIVE, Drive, tick_times
+from drnav_jax.bench.drive import FAMILY, Drive, tick_times
 from drnav_jax.models import fusion, network, weights
 from drnav_jax.models.calibration import Calibration
 from drnav_jax.models.network import NetworkSpec
@@ -56,11 +56,11 @@ def fused(drive: Drive, trained: Trained, seed: int = 0) -> Drive:
     """The same drive of a robot that has cameras, and the network as its predictor.
 
     Args:
-        drive: From `bench_planning.record`, of the same seed.
+        drive: From `drive.record`, of the same seed.
         trained: The network.
         seed: Of the world.
     """
-    world, rig = worlds.sample(DRIVE, seed).world, RigSpec()
+    world, rig = worlds.sample(FAMILY, seed).world, RigSpec()
     spec = dataclasses.replace(drive.spec, predictor=fusion.predictor(trained.spec))
     predictor: Any = fusion.params_of(trained, rule=drive.params.predictor)
     params = drive.params._replace(predictor=jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), predictor))
@@ -78,7 +78,7 @@ def network_times(drive: Drive, warm_up: int, repeats: int) -> dict[str, Any]:
     """`network` and `tick_fusion`, times in ms.
 
     Args:
-        drive: From `bench_planning.record`.
+        drive: From `drive.record`.
         warm_up: First ticks that do not count.
         repeats: Answers of the network alone.
     """
