@@ -32,7 +32,7 @@ demo: $(STAMP)  ## one trap, with and without dead-end prediction
 	$(BIN)/drnav compare $(DEMO_ARGS)
 
 test: $(STAMP)  ## the tests, but for the slow ones
-	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 test-all: $(STAMP)  ## every test, as users compile it
 	XLA_FLAGS="$(XLA_FLAGS)" $(BIN)/python -m pytest -q $(PYTEST_ARGS)

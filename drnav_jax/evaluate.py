@@ -38,6 +38,7 @@ class Setup:
         planner: A row of `planning.compositions`.
         predictor: Where dead-end evidence comes from: fusion, geometric, oracle or none.
         weights: File of the fusion network's weights; None = those that come with the package.
+        recovery: What the planner does when stuck: drnav, nav2 or none; None = its own.
         risk_weight: Lambda of eq. 7 and of the route's cell cost; None = the planner's default.
         horizon: H [s]; None = the planner's default.
         robot_radius: [m].
@@ -55,6 +56,7 @@ class Setup:
     planner: str = "drnav"
     predictor: str = "geometric"
     weights: Path | None = None
+    recovery: str | None = None
     risk_weight: float | None = None
     horizon: float | None = None
     robot_radius: float = 0.25
@@ -70,7 +72,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        planner(self.planner)
+        planner(self.planner, self.recovery)
         if self.physics not in PHYSICS:
             raise ValueError(f'There is no physics "{self.physics}": choose from {", ".join(PHYSICS)}.')
         if self.predictor not in PREDICTORS:
@@ -95,7 +97,7 @@ class Setup:
     @property
     def nav(self) -> NavSpec:
         """The robot's spec."""
-        return spec_of(self.planner, self.evidence, self.num_candidates, self.weights)
+        return spec_of(self.planner, self.evidence, self.num_candidates, self.weights, self.recovery)
 
 
 def equipped(spec: EpisodeSpec, setup: Setup) -> EpisodeSpec:
@@ -129,13 +131,15 @@ def trained(file: Path | None) -> weights.Trained:
 
 
 @functools.cache
-def spec_of(planner_name: str, predictor: str, num_candidates: int, file: Path | None = None) -> NavSpec:
+def spec_of(
+    planner_name: str, predictor: str, num_candidates: int, file: Path | None = None, recovery: str | None = None
+) -> NavSpec:
     """The robot's spec: 256 headings, the other candidates are controls; `file` holds the fusion network's weights."""
     without = {"geometric": geometric.predict, "oracle": oracle.predict, "none": silent.predict}
     predict = without[predictor] if predictor in without else fusion.predictor(trained(file).spec)
     speeds = 12 if num_candidates < 2048 else 16
     generator = GeneratorSpec(num_speeds=speeds, num_turns=(num_candidates - 256) // speeds, num_headings=256)
-    return NavSpec(planner=planner(planner_name), predictor=predict, generator=generator)
+    return NavSpec(planner=planner(planner_name, recovery), predictor=predict, generator=generator)
 
 
 @functools.cache

@@ -81,7 +81,7 @@ class NavSpec:
             raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
         if self.planner.tracker == "mppi" and abs(self.follower.mppi.dt - self.dt) > 1e-6:
             raise ValueError(f"MPPI's step must be the tick, {self.dt} s: follower.mppi.dt is {self.follower.mppi.dt}.")
-        if not self.planner.controls and self.generator.num_speeds:
+        if not self.planner.controls:
             object.__setattr__(self, "generator", dataclasses.replace(self.generator, num_speeds=0))
 
 
@@ -181,9 +181,8 @@ def _sane(params: NavParams, state: NavState, seen: Observation) -> tuple[Observ
             image_valid=seen.image_valid & image_ok,
             goal=jnp.where(jnp.all(jnp.isfinite(seen.goal)), seen.goal, pose[:2]),
         ),
-        pose_ok,
-        leap,
-    )
+        pose_ok, leap,
+    )  # fmt: skip
 
 
 def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observation, leap: Array) -> NavState:
@@ -195,17 +194,14 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
 
     def shifted() -> tuple[Array, Array, Array, MemoryState]:
         return (
-            geometry.shift(state.plan, by, _NO_PLAN),
-            geometry.shift(state.risk, by, 0.0),
-            geometry.shift(state.recovery.visits, by, 0.0),
-            memory.shift(spec.memory, state.memory, by),
-        )
+            geometry.shift(state.plan, by, _NO_PLAN), geometry.shift(state.risk, by, 0.0),
+            geometry.shift(state.recovery.visits, by, 0.0), memory.shift(spec.memory, state.memory, by),
+        )  # fmt: skip
 
     unmoved = lambda: (state.plan, state.risk, state.recovery.visits, state.memory)  # noqa: E731
     plan, risk, visits, held = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
-    return state._replace(
-        belief=moved, plan=plan, risk=risk, memory=held, recovery=state.recovery._replace(visits=visits)
-    )
+    recover = state.recovery._replace(visits=visits)
+    return state._replace(belief=moved, plan=plan, risk=risk, memory=held, recovery=recover)
 
 
 def _fine_clearance(spec: NavSpec, params: NavParams, held: FilterState) -> Float[Array, "n n"]:
@@ -228,7 +224,7 @@ def rollout_field(spec: NavSpec, params: NavParams, state: NavState) -> tuple[Gr
 def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation) -> NavState:
     """Evidence -> belief -> risk; recovery points; cost-to-go."""
     grid, planner, robot = spec.filter.grid, spec.planner, params.robot
-    local = belief.local_map(spec.filter, state.belief)
+    local = belief.local_map(spec.filter, state.belief, params.filter)
     nothing = jnp.zeros(grid.shape, jnp.float32)
     held, risk = state.belief, nothing
     if planner.predicts:
@@ -236,7 +232,8 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         everywhere = jnp.ones(grid.shape, bool)  # where it has nothing to say its confidence is 0
         held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)
         risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
-    clear = costmap.clearance(local.seen & (local.occupancy > 0), grid.resolution)
+    assert local.closed is not None
+    clear = costmap.clearance(local.closed, grid.resolution)
     top, left = belief.local_corner(spec.filter)
     near = grids.pool(_fine_clearance(spec, params, state.belief), 2, "max")  # what rollouts will find there
     clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
@@ -255,7 +252,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     found = None
     if planner.needs_route or planner.recovery == "drnav":
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
-        squeeze = state.time < state.squeeze_until
+        squeeze = (state.time < state.squeeze_until) | retreating
         ways = params.route if planner.generates else params.follower.route
         margin = jnp.where(squeeze, ways.squeeze_margin, ways.closed_margin)
         remembered = memory.update(
@@ -278,6 +275,16 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         value, reachable = jnp.where(retreating, value, direct), reachable | ~retreating
         exposed = jnp.maximum(risk, visits)  # no route that visits could be priced in: they count as exposure
     exposed = exposed if planner.exposure else nothing
+    if planner.recovery == "drnav":
+        assert found is not None
+        recover = jax.lax.cond(
+            behaviour.looking(recover, state.time),
+            lambda: behaviour.look_back(
+                params.recovery, recover, state.time, points.xy, points.rank, points.last_seen, points.valid, found,
+                local.seen & (local.occupancy < 0), value, clear, local.origin, grid.resolution, seen.pose,
+            ),
+            lambda: recover,
+        )  # fmt: skip
     following = state.follower
     if following is not None:
         following = follower.replan(
@@ -286,7 +293,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         )  # fmt: skip
     return state._replace(
         belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, squeeze_until=until,
-        points=points, memory=remembered, follower=following,
+        points=points, memory=remembered, recovery=recover, follower=following,
     )
 
 
@@ -296,36 +303,35 @@ def _act(
     """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
     pose, twist, time = seen.pose, seen.twist, state.time
-    window = belief.local_map(spec.filter, state.belief)
+    window = GridMap(state.risk, geometry.window_origin(state.belief.corner, grid), grid.resolution)
     local, field = rollout_field(spec, params, state)
 
     arrived = jnp.hypot(seen.goal[0] - pose[0], seen.goal[1] - pose[1]) <= params.goal_tolerance
     recover = behaviour.wait(state.recovery, time, arrived | ~healthy)
     heading_for = jnp.where(recover.mode == behaviour.RETREAT, recover.target, seen.goal)
-    squeeze = time < state.squeeze_until
-    narrow = jnp.minimum(params.route.squeeze_margin, params.score.margin)
-    score = params.score._replace(margin=jnp.where(squeeze, narrow, params.score.margin))
-    if planner.generates:
-        choice = goal_generator.generate(
+    squeeze = (time < state.squeeze_until) | (recover.mode == behaviour.RETREAT)
+    margin = params.score.margin
+    score = params.score._replace(margin=jnp.where(squeeze, jnp.minimum(params.route.squeeze_margin, margin), margin))
+    choice = goal_generator.given(seen.goal)
+    if planner.generates or planner.recovery == "drnav":
+        made = goal_generator.generate(
             spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
             jnp.asarray(params.hysteresis, jnp.float32),
         )  # fmt: skip
-    else:
-        choice = goal_generator.given(seen.goal)
+        back = recover.mode == behaviour.RETREAT  # along the route, whoever drives
+        choice = jax.tree.map(lambda a, b: a if planner.generates else jnp.where(back, a, b), made, choice)
     if planner.recovery == "drnav":
-        visited = GridMap(recover.visits, window.origin, grid.resolution)
-        points = state.points
-        refuge, has_refuge = behaviour.choose(
-            params.recovery, points.xy, points.rank, points.valid,
-            geometry.sample_nearest(visited, points.xy, fill=0.0), pose[:2],
-        )  # fmt: skip
+        risky = jnp.asarray(False)
+        if planner.exposure and not planner.risk_in_route:  # a route that prices risk turns away by itself
+            inside = geometry.sample_nearest(window, pose[:2]) > 0.5
+            risky = (choice.exposure > params.recovery.risky_exposure) & ~inside
+        driven = jnp.abs(twist[0]) * spec.dt
         recover = behaviour.update(
-            grid, params.recovery, recover, time, spec.dt, pose[:2], jnp.abs(twist[0]) * spec.dt, window.origin,
-            choice.valid, state.reachable,
-            refuge, has_refuge,
+            grid, params.recovery, recover, time, spec.dt, pose[:2], driven, window.origin, choice.valid, state.reachable,
+            risky, choice.xy,
         )  # fmt: skip
-    seek_room, critics = recover.mode == behaviour.CLEAR, None
     following: Any = state.follower
+    seek_room, critics = recover.mode == behaviour.CLEAR, None
     track = tracker.track(spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, seek_room)
     if planner.follows:
         n, (top, left) = spec.filter.local_cells, belief.local_corner(spec.filter)
@@ -351,9 +357,7 @@ def _act(
         mode=mode,
         arrived=arrived,
         recoveries=entries,
-        p_dead=dead_end.probability(
-            geometry.sample_nearest(GridMap(state.belief.dead_end, window.origin, grid.resolution), pose[:2])
-        ),
+        p_dead=dead_end.probability(geometry.sample_nearest(window._replace(values=held.dead_end), pose[:2])),
         clearance=geometry.sample_bilinear(local, pose[:2]),
         fault=~healthy | leap | ~jnp.any(seen.point_valid),
         critics=critics,

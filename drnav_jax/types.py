@@ -223,6 +223,7 @@ class LocalMap(NamedTuple):
     seen: Bool[Array, "H W"]  # observed at least once since the window holds the cell
     origin: Float[Array, "2"]  # odom x, y of the outer corner of cell (0, 0) [m]
     resolution: Scalar  # [] [m / cell]
+    closed: Array | None = None  # [H, W] bool, what stops a robot as all sensors say; None: what is occupied does
 
 
 class Evidence(NamedTuple):
@@ -230,6 +231,7 @@ class Evidence(NamedTuple):
 
     p_dead: Float[Array, "H W"]  # probability that the cell is a dead end
     confidence: Float[Array, "H W"]  # 0 = no evidence here (the belief is left alone) .. 1 = full weight
+    blocked: Array | None = None  # [H, W] log-odds that something stops a robot [nat], 0 = no opinion; None: none at all
 
 
 class Command(NamedTuple):

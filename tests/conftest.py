@@ -35,6 +35,19 @@ hypothesis.settings.register_profile("drnav", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("drnav")
 
 
+# Files that take longest, longest first: two workers that take whole files end together only if none begins late.
+LONGEST = (
+    "test_bench", "test_evaluate", "test_cli", "test_step", "test_gather", "test_readme", "test_driving", "test_cli_learn",
+    "test_navigator", "test_job", "test_network", "test_fusion", "test_labels", "test_mjx", "test_families",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """Longest files first; all else stays in order."""
+    rank = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
     """Runs a test's body without implicit dtype or rank promotion, unless it is marked `relaxed`.

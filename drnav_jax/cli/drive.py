@@ -47,7 +47,7 @@ def setups_of(args: Run | Compare) -> dict[str, evaluate.Setup]:
     names = [args.planner] if isinstance(args, Run) else [name.strip() for name in args.planners.split(",")]
     if len(set(names)) < len(names):
         raise ValueError(f"--planners names one twice: {', '.join(names)}.")
-    same = ("weights", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
+    same = ("weights", "recovery", "risk_weight", "horizon", "robot_radius", "max_speed", "lidar_range", "goal_tolerance")
     common: Any = {name: getattr(args, name) for name in (*same, "time_limit", "seed", "physics", "mjx_boxes")}
     common["predictor"] = _predictor(args)
     return {name: evaluate.Setup(planner=name, **common) for name in names}

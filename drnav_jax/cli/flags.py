@@ -38,6 +38,7 @@ class Trial:
         episodes: Worlds of a family; sampled trips on a map; repeats, with other sensor noise, of a given trip.
         predictor: Where dead-end evidence comes from.
         weights: Of the fusion network, from `drnav train`.
+        recovery: What planners do when stuck; nav2: clear, spin, wait and back up in turn.
         no_cameras: The robot has a LiDAR only; the geometric rule stands in for the network.
         risk_weight: Lambda of eq. 1 and 7; 0 = dead ends do not matter.
         horizon: H, how far ahead candidates are rolled out [s].
@@ -66,6 +67,9 @@ class Trial:
     predictor: Literal["fusion", "geometric", "oracle", "none"] = "fusion"
     weights: Annotated[Path | None, _flag("FILE", "default: those that come with drnav")] = None
     no_cameras: bool = False
+    recovery: Annotated[
+        Literal["drnav", "nav2", "none"] | None, _flag("drnav|nav2|none", "default: each planner's own")
+    ] = None
     risk_weight: Annotated[float | None, _flag("F", "default: the planner's")] = None
     horizon: Annotated[float | None, _flag("S", "default: the planner's, 4 s")] = None
     seed: Annotated[int, _flag("N")] = 0

@@ -1,4 +1,4 @@
-"""What the robot believes about its surroundings: occupancy and dead ends on one rolling window.
+"""What the robot believes about its surroundings - occupancy, dead ends, holes and barriers - on one rolling window.
 
 The window is aligned with odom and moves by whole strides of cells, so beliefs are moved and never
 blurred; what rolls in is unknown (never seen, log-odds 0, dead-end belief at its prior l_0).
@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from drnav_jax import geometry
-from drnav_jax.filter import dead_end, occupancy
+from drnav_jax.filter import barrier, dead_end, occupancy
+from drnav_jax.filter.barrier import BarrierParams
 from drnav_jax.filter.dead_end import DeadEndParams
 from drnav_jax.filter.occupancy import OccupancyParams
 from drnav_jax.types import Evidence, GridSpec, LocalMap, Scalar
@@ -46,10 +47,11 @@ class FilterSpec:
 
 
 class FilterParams(NamedTuple):
-    """Parameters of both beliefs."""
+    """Parameters of the beliefs."""
 
     occupancy: OccupancyParams = OccupancyParams()
     dead_end: DeadEndParams = DeadEndParams()
+    barrier: BarrierParams = BarrierParams()
 
 
 class FilterState(NamedTuple):
@@ -59,6 +61,8 @@ class FilterState(NamedTuple):
     seen: Array  # [H, W] bool, observed since the window holds the cell
     surface: Array  # [2n, 2n] around the robot: share of a cell's returns in each of its quarters (`occupancy.refine`)
     dead_end: Array  # [H, W] log-odds of being a dead end [nat]
+    hole: Array  # [H, W] log-odds of missing ground [nat]; 0 = nothing known
+    barrier: Array  # [H, W] log-odds that something unseen by LiDAR stops a robot [nat]; < 0: what it sees does not
     corner: Array  # [2] int32 (row, column) of cell (0, 0) on the odom lattice
 
 
@@ -71,6 +75,8 @@ def init(spec: FilterSpec, params: FilterParams, xy: Float[Array, "2"]) -> Filte
         seen=jnp.zeros(shape, bool),
         surface=jnp.zeros((2 * spec.local_cells,) * 2, jnp.float32),
         dead_end=jnp.full(shape, dead_end.prior_log_odds(params.dead_end)),
+        hole=jnp.zeros(shape, jnp.float32),
+        barrier=jnp.zeros(shape, jnp.float32),
         corner=geometry.window_corner(xy, spec.grid),
     )
 
@@ -90,6 +96,8 @@ def move(spec: FilterSpec, params: FilterParams, state: FilterState, xy: Float[A
             seen=geometry.shift(state.seen, by, 0.0),
             surface=geometry.shift(state.surface, 2 * by, 0.0),
             dead_end=geometry.shift(state.dead_end, by, dead_end.prior_log_odds(params.dead_end)),
+            hole=geometry.shift(state.hole, by, 0.0),
+            barrier=geometry.shift(state.barrier, by, 0.0),
             corner=corner,
         )
 
@@ -102,20 +110,26 @@ def local_corner(spec: FilterSpec) -> tuple[int, int]:
     return (h - spec.local_cells) // 2, (w - spec.local_cells) // 2
 
 
+def closed(params: FilterParams, state: FilterState) -> Bool[Array, "H W"]:
+    """Cells that stop a robot: what LiDAR returned from, but for what does not (grass), and what it does not show."""
+    return barrier.closed(params.barrier, state.seen & (state.occupancy > 0), state.hole, state.barrier)
+
+
 def obstacles(spec: FilterSpec, params: FilterParams, state: FilterState) -> Bool[Array, "n n"]:
-    """Obstacles around the robot on cells of half the map's edge; begins at `local_corner`."""
+    """What stops a robot around it, on cells of half the map's edge; begins at `local_corner`."""
     n, (top, left) = spec.local_cells, local_corner(spec)
-    occupied = (state.seen & (state.occupancy > 0))[top : top + n, left : left + n]
-    return occupancy.fine_obstacles(params.occupancy, occupied, state.surface)
+    near = closed(params, state)[top : top + n, left : left + n]
+    return occupancy.fine_obstacles(params.occupancy, near, state.surface)
 
 
-def local_map(spec: FilterSpec, state: FilterState) -> LocalMap:
-    """The occupancy belief as predictors and planners read it."""
+def local_map(spec: FilterSpec, state: FilterState, params: FilterParams | None = None) -> LocalMap:
+    """The map as predictors read it; with `params` also what is closed to a robot."""
     return LocalMap(
         occupancy=state.occupancy,
         seen=state.seen,
         origin=geometry.window_origin(state.corner, spec.grid),
         resolution=jnp.asarray(spec.grid.resolution, jnp.float32),
+        closed=None if params is None else closed(params, state),
     )
 
 
@@ -129,7 +143,8 @@ def forget(spec: FilterSpec, state: FilterState, xy: Float[Array, "2"], radius: 
     fine = jnp.repeat(jnp.repeat(near[top : top + n, left : left + n], 2, axis=0), 2, axis=1)
     return state._replace(
         occupancy=jnp.where(near, 0.0, state.occupancy), seen=state.seen & ~near,
-        surface=jnp.where(fine, 0.0, state.surface),
+        surface=jnp.where(fine, 0.0, state.surface), hole=jnp.where(near, 0.0, state.hole),
+        barrier=jnp.where(near, 0.0, state.barrier),
     )  # fmt: skip
 
 
@@ -178,7 +193,11 @@ def observe(
     belief, seen = occupancy.apply(
         params.occupancy, state.occupancy, state.seen, origin, resolution, pose, hit, crossed
     )
-    return state._replace(occupancy=belief, seen=seen, surface=surface), hit | crossed
+    fell, landed = barrier.fallen(
+        params.barrier, params.occupancy.sensor_z, spec.grid.shape, origin, resolution, pose, points, point_valid
+    )
+    hole = barrier.observe(params.barrier, state.hole, fell, landed)
+    return state._replace(occupancy=belief, seen=seen, surface=surface, hole=hole), hit | crossed
 
 
 @jax.jit
@@ -189,6 +208,9 @@ def assimilate(
     visible: Bool[Array, "H W"],
     dt: Scalar,
 ) -> FilterState:
-    """Fold dead-end evidence into the belief (eq. 5); see `dead_end.update`."""
+    """Fold a predictor's evidence into the beliefs about dead ends (eq. 5, `dead_end.update`) and barriers."""
     belief = dead_end.update(params.dead_end, state.dead_end, evidence, visible, dt)
-    return state._replace(dead_end=belief)
+    state = state._replace(dead_end=belief)
+    if evidence.blocked is None:
+        return state
+    return state._replace(barrier=barrier.assimilate(params.barrier, state.barrier, evidence.blocked))

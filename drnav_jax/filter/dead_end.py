@@ -80,7 +80,7 @@ def update(
         l_t, within [l_min, l_max].
     """
     l_0 = prior_log_odds(params)
-    p_hat, confidence = evidence
+    p_hat, confidence = evidence.p_dead, evidence.confidence
     used = visible & jnp.isfinite(p_hat) & jnp.isfinite(confidence) & (confidence > 0)
     weight = params.gain * jnp.where(used, jnp.minimum(confidence, 1.0), 0.0)
     p_hat = jnp.clip(jnp.where(used, p_hat, 0.5), _P_MIN, 1 - _P_MIN)

@@ -8,6 +8,11 @@ cell's answer weighs:
     (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
 
 `weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper).
+
+What it says of traversability corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with no
+return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass,
+
+    (4)  blocked(c) = `weight` m logit(1 - t(c)) within `sight` of the robot, kept within +-`most`; 0 elsewhere
 """
 
 import functools
@@ -40,6 +45,8 @@ class FusionParams(NamedTuple):
     unseen: Scalar = 0.6  # [] w of eq. 2
     still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
+    sight: Scalar = 5.0  # [] eq. 4 [m]
+    most: Scalar = 2.0  # [] eq. 4 [nat]
     rule: GeometricParams = GeometricParams()  # an input of the network, and the answer where there is no camera
 
 
@@ -51,6 +58,7 @@ def params_of(trained: Trained, **changes: Any) -> FusionParams:
 def inputs_of(spec: NetworkSpec, params: FusionParams, observation: Observation, local_map: LocalMap) -> Inputs:
     """What the network reads, as a batch of one."""
     asked = observation._replace(goal=jnp.full(2, FAR_GOAL, jnp.float32))
+    local_map = local_map._replace(closed=None)  # as in training: the map of the LiDAR alone
     rule = geometric.predict(params.rule, asked, local_map)
     at = lambda values: bev.resample(  # noqa: E731
         spec.bev, GridMap(values, local_map.origin, local_map.resolution), observation.pose, 0.0
@@ -78,6 +86,12 @@ def _grown(mask: Array, cells: int) -> Array:
     return grown > 0
 
 
+def _moves(params: FusionParams, observation: Observation) -> Float[Array, ""]:
+    """Eq. 3."""
+    speed = jnp.max(jnp.abs(observation.twist)) / jnp.maximum(params.moving, 1e-3)
+    return params.still + (1.0 - params.still) * jnp.minimum(speed, 1.0)
+
+
 def trust(
     spec: NetworkSpec, params: FusionParams, observation: Observation, known: Array
 ) -> Float[Array, "h w"]:
@@ -85,13 +99,23 @@ def trust(
     seen = known == FREE
     near = _grown(seen, round(NEAR / spec.bev.resolution)) & (known != OCCUPIED)
     where = jnp.where(seen, 1.0, jnp.where(near, params.unseen, 0.0))
-    speed = jnp.max(jnp.abs(observation.twist)) / jnp.maximum(params.moving, 1e-3)
-    moves = params.still + (1.0 - params.still) * jnp.minimum(speed, 1.0)
-    return (params.weight * moves * where).astype(jnp.float32)
+    return (params.weight * _moves(params, observation) * where).astype(jnp.float32)
+
+
+def blocked(
+    spec: NetworkSpec, params: FusionParams, observation: Observation, known: Array, traversable: Array
+) -> Float[Array, "h w"]:
+    """Eq. 4 on the network's grid, from the logits of t."""
+    returned = known == OCCUPIED
+    asked = returned | ((known == FREE) & ~_grown(returned, 1))
+    x, y = geometry.cell_centres(spec.bev.shape, jnp.asarray(spec.bev.origin, jnp.float32), spec.bev.resolution)
+    asked &= (x * x + y * y <= jnp.square(params.sight)) & jnp.isfinite(traversable)
+    said = jnp.clip(-traversable, -params.most, params.most)
+    return jnp.where(asked & jnp.any(observation.image_valid), params.weight * _moves(params, observation) * said, 0.0)
 
 
 def evidence(
-    spec: NetworkSpec, pose: Float[Array, "3"], p_dead: Array, confidence: Array, local_map: LocalMap
+    spec: NetworkSpec, pose: Float[Array, "3"], p_dead: Array, confidence: Array, barred: Array, local_map: LocalMap
 ) -> Evidence:
     """From the network's grid to the window: each of its cells reads the network's cell under its centre."""
     h, w = local_map.occupancy.shape
@@ -103,6 +127,7 @@ def evidence(
     return Evidence(
         p_dead=geometry.sample_nearest(grid(p_dead), local, fill=0.0),
         confidence=geometry.sample_nearest(grid(confidence), local, fill=0.0),
+        blocked=geometry.sample_nearest(grid(barred), local, fill=0.0),
     )
 
 
@@ -119,6 +144,7 @@ def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMa
         sound = jnp.isfinite(out.dead)
         p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
         confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
-        return evidence(spec, observation.pose, p_dead, confidence, local_map)
+        barred = blocked(spec, params, observation, known, out.traversable)
+        return evidence(spec, observation.pose, p_dead, confidence, barred, local_map)
 
     return predict

@@ -57,8 +57,9 @@ def predict(params: GeometricParams, observation: Observation, local_map: LocalM
     by = _POOLING
     h, w = local_map.occupancy.shape
     size = local_map.resolution * by
-    occupied = grids.once(grids.pool(local_map.seen & (local_map.occupancy > 0), by, "any"))
-    seen = grids.once(grids.pool(local_map.seen, by, "all"))
+    closed = local_map.seen & (local_map.occupancy > 0) if local_map.closed is None else local_map.closed
+    occupied = grids.once(grids.pool(closed, by, "any"))
+    seen = grids.once(grids.pool(local_map.seen | closed, by, "all"))
     shape = occupied.shape
     # in cells, so that the resolution may be traced
     reach = 5.0
@@ -76,10 +77,10 @@ def predict(params: GeometricParams, observation: Observation, local_map: LocalM
     passable = free & (to_robot > params.body)
     open_ = grids.flood_fill(passable, seeds)
     # the disc must cut: where the robot stands in the open, a small enclosed remainder is no dead end
-    closed = passable & ~open_
+    shut = passable & ~open_
     verdict = free & (to_robot <= params.range) & (to_robot > params.body)
     well_seen = jnp.clip(_box_mean(seen.astype(jnp.float32), 3) / params.seen_share, 0.0, 1.0)
-    confidence = jnp.where(verdict, jnp.where(closed, 1.0, params.open_confidence) * well_seen, 0.0)
-    p_dead = jnp.where(closed, params.p_dead, params.p_open).astype(jnp.float32)
+    confidence = jnp.where(verdict, jnp.where(shut, 1.0, params.open_confidence) * well_seen, 0.0)
+    p_dead = jnp.where(shut, params.p_dead, params.p_open).astype(jnp.float32)
     p_dead, confidence = grids.once((p_dead, confidence))
     return Evidence(p_dead=grids.once(grids.repeat(p_dead, by)), confidence=grids.once(grids.repeat(confidence, by)))

@@ -5,8 +5,9 @@ With the mask m and the weight w of a cell, z the logit, y the truth, and sums o
     (1)  w(c)   = m(c) w_v(visibility) [1 + w_i interior(c)]            where the twin's label differs is the real question
     (2)  L_dead = Σ w (1 - p_y)^γ BCE(z, y) / Σ w                       γ = 0: cross-entropy, which stays calibrated
     (3)  L_path = Σ s BCE(z, y) / Σ s,  s = 1 if the label is stable, else `unstable`;  L_flag likewise
-    (4)  L_trav over all cells inside the world, L_rec over the valid ones; L_depth = |log(1 + d̂) - log(1 + d)| (Huber)
-         over the dead ends
+    (4)  L_trav over all cells inside the world, where the map is wrong all the more: w_h on what it holds to be free and is
+         not (a pane), w_g on what it holds to be occupied and is not (tall grass); such cells are few, and the rest can be
+         read off the map. L_rec over the valid cells; L_depth = |log(1 + d̂) - log(1 + d)| (Huber) over the dead ends
     (5)  L = L_dead + Σ weight · L_other
 
 Losses come as sums and weights, so that devices which share a batch can add both before they divide.
@@ -17,9 +18,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, UInt8
 
 from drnav_jax.models.batch import BEFORE, NEVER, Targets
+from drnav_jax.models.bev import FREE, OCCUPIED
 from drnav_jax.models.network import Outputs
 from drnav_jax.types import Scalar
 
@@ -39,6 +41,8 @@ class LossParams(NamedTuple):
     traversable: Scalar = 0.3  # []
     recoverability: Scalar = 0.1  # []
     depth: Scalar = 0.1  # []
+    hidden: Scalar = 30.0  # [] w_h of eq. 4
+    veiled: Scalar = 5.0  # [] w_g of eq. 4
 
 
 def _weighed(values: Array, weights: Array) -> tuple[Array, Array]:
@@ -52,13 +56,16 @@ def _focal(logits: Array, truth: Array, gamma: Scalar) -> Array:
     return cross * jnp.power(jnp.maximum(wrong, 1e-6), gamma)
 
 
-def sums(params: LossParams, outputs: Outputs, targets: Targets) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
+def sums(
+    params: LossParams, outputs: Outputs, targets: Targets, local_map: UInt8[Array, "B h w"]
+) -> dict[str, tuple[Float[Array, ""], Float[Array, ""]]]:
     """(weighted sum, sum of weights) of every term of `TERMS`.
 
     Args:
         params: Weights.
         outputs: Of B frames.
         targets: Of the same.
+        local_map: What the network knew of them, classes of `models.bev`.
     """
     real = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
     valid, dead = real(targets.valid), real(targets.dead_end)
@@ -67,12 +74,14 @@ def sums(params: LossParams, outputs: Outputs, targets: Targets) -> dict[str, tu
     weight = valid * seen * (1.0 + params.interior * real(targets.interior))
     stable = lambda a: jnp.where(a, 1.0, params.unstable)  # noqa: E731
     depth = jnp.log1p(jnp.maximum(real(targets.depth), 0.0))
+    wrong = jnp.where((local_map == FREE) & ~targets.traversable, params.hidden, 1.0)
+    wrong = jnp.where((local_map == OCCUPIED) & targets.traversable, params.veiled, wrong)
     bce = optax.sigmoid_binary_cross_entropy
     return {
         "dead": _weighed(_focal(outputs.dead, dead, params.gamma), weight),
         "path": _weighed(bce(outputs.path, real(targets.path)), stable(targets.path_stable)),
         "flag": _weighed(bce(outputs.flag, real(targets.dead_end_flag)), stable(targets.flag_stable)),
-        "traversable": _weighed(bce(outputs.traversable, real(targets.traversable)), real(targets.inside)),
+        "traversable": _weighed(bce(outputs.traversable, real(targets.traversable)), real(targets.inside) * wrong),
         "recoverability": _weighed(bce(outputs.recoverability, real(targets.recoverability)), valid),
         "depth": _weighed(optax.losses.huber_loss(outputs.depth, depth, delta=0.5), valid * dead),
     }

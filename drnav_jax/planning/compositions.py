@@ -82,12 +82,17 @@ PLANNERS = {
 }
 
 
-def planner(name: str) -> Composition:
+def planner(name: str, recovery: str | None = None) -> Composition:
     """The composition of a named planner.
 
+    Args:
+        name: A row of `PLANNERS`.
+        recovery: What it does when stuck, instead of its own: "drnav", "nav2" or "none".
+
     Raises:
-        ValueError: If there is no such planner.
+        ValueError: If there is no such planner, or no such recovery.
     """
     if name not in PLANNERS:
         raise ValueError(f'There is no planner "{name}": choose from {", ".join(PLANNERS)}.')
-    return PLANNERS[name]
+    own = PLANNERS[name]
+    return own if recovery is None else dataclasses.replace(own, recovery=recovery)

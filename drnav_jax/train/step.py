@@ -75,7 +75,7 @@ def stepper(spec: TrainSpec, mesh: Mesh) -> Callable[[TrainState, Batch], tuple[
         seen = augment(spec.augment, batch, key, first)
 
         def loss(p: Any) -> tuple[Array, dict[str, Array]]:
-            terms = losses.sums(spec.loss, network.apply(spec.network, p, seen.inputs), seen.targets)
+            terms = losses.sums(spec.loss, network.apply(spec.network, p, seen.inputs), seen.targets, seen.inputs.local_map)
             over = jax.lax.psum({name: weight for name, (_, weight) in terms.items()}, AXIS)
             return losses.total(spec.loss, terms, over)
 

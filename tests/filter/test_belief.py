@@ -26,13 +26,15 @@ def random_state(seed, xy):
         surface=jnp.asarray(rng.random(state.surface.shape), jnp.float32),
         dead_end=jnp.asarray(rng.normal(size=seen.shape), jnp.float32),
         corner=state.corner,
+        hole=jnp.asarray(rng.normal(size=seen.shape), jnp.float32),
+        barrier=jnp.asarray(rng.normal(size=seen.shape), jnp.float32),
     )
 
 
 def by_lattice_cell(state):
     """(row, column) on the odom lattice -> what is believed there."""
     corner = np.asarray(state.corner)
-    fields = [np.asarray(f) for f in (state.occupancy, state.seen, state.dead_end)]
+    fields = [np.asarray(f) for f in (state.occupancy, state.seen, state.dead_end, state.hole, state.barrier)]
     return {
         (int(corner[0]) + i, int(corner[1]) + j): tuple(f[i, j] for f in fields) for i, j in np.ndindex(SPEC.grid.shape)
     }
@@ -53,7 +55,7 @@ def test_the_window_moves_and_never_blurs(seed, at, by):
         if cell in old:
             assert values == old[cell]
         else:
-            assert values[:2] == (0, False) and values[2] == pytest.approx(L0, abs=1e-5)
+            assert values[:2] == (0, False) and values[2] == pytest.approx(L0, abs=1e-5) and values[3:] == (0, 0)
     # The robot is within half a stride of the middle.
     origin = np.asarray(belief.local_map(SPEC, moved).origin)
     middle = origin + np.array([16, 12]) * 0.1 / 2

@@ -72,7 +72,8 @@ def network_cell(pose, x, y):
 def test_a_painted_cell_lands_where_it_lies_in_odom(pose, painted):
     p_dead, confidence = np.full(BEV.shape, 0.1, np.float32), np.full(BEV.shape, 0.2, np.float32)
     p_dead[painted], confidence[painted] = 0.9, 0.7
-    got = jax.device_get(fusion.evidence(SPEC, f32(pose), jnp.asarray(p_dead), jnp.asarray(confidence), window()))
+    grids = [jnp.asarray(a) for a in (p_dead, confidence, confidence - 0.5)]
+    got = jax.device_get(fusion.evidence(SPEC, f32(pose), *grids, window()))
     count = 0
     for i in range(SHAPE[0]):
         for j in range(SHAPE[1]):
@@ -82,6 +83,7 @@ def test_a_painted_cell_lands_where_it_lies_in_odom(pose, painted):
             inside = 0 <= cell[0] < BEV.shape[0] and 0 <= cell[1] < BEV.shape[1]
             want = (0.9, 0.7) if cell == painted else (0.1, 0.2) if inside else (0.0, 0.0)
             assert abs(got.p_dead[i, j] - want[0]) < 1e-6 and abs(got.confidence[i, j] - want[1]) < 1e-6, (i, j)
+            assert abs(got.blocked[i, j] - (want[1] - 0.5 if inside else 0.0)) < 1e-6, (i, j)
             count += cell == painted
     assert count >= 10  # of the 16 window cells that are as large as it
 
@@ -113,6 +115,32 @@ def test_a_robot_that_stands_trusts_less(twist, share):
     params = FusionParams(None, weight=0.4, still=0.2, moving=0.3)
     got = fusion.trust(SPEC, params, observed(twist=twist), jnp.full(BEV.shape, FREE, jnp.uint8))
     np.testing.assert_allclose(got, np.full(BEV.shape, 0.4 * share), rtol=1e-5)
+
+
+def test_what_it_says_of_panes_and_grass():
+    rng = np.random.default_rng(1)
+    spec = dataclasses.replace(SPEC, bev=dataclasses.replace(BEV, shape=(16, 40)))
+    known = rng.choice([UNKNOWN, FREE, OCCUPIED], (16, 40), p=[0.2, 0.75, 0.05]).astype(np.uint8)
+    logits = (3 * rng.normal(size=known.shape)).astype(np.float32)
+    logits[0, 0] = np.nan
+    params = FusionParams(None, weight=0.4, still=0.2, moving=0.3, sight=2.5, most=1.5)
+    ask = lambda seen: np.asarray(fusion.blocked(spec, params, seen, jnp.asarray(known), jnp.asarray(logits)))  # noqa: E731
+    got, count = ask(observed(twist=(0.9, 0.0))), {FREE: 0, OCCUPIED: 0}
+    for i, j in np.ndindex(16, 40):
+        x = spec.bev.ahead + (j + 0.5 - 20) * spec.bev.resolution
+        y = (i + 0.5 - 8) * spec.bev.resolution
+        beside = known[max(0, i - 1) : i + 2, max(0, j - 1) : j + 2]
+        asked = known[i, j] == OCCUPIED or (known[i, j] == FREE and not (beside == OCCUPIED).any())
+        if abs(math.hypot(x, y) - 2.5) < 1e-4:
+            continue
+        said = asked and math.hypot(x, y) < 2.5 and np.isfinite(logits[i, j])
+        want = 0.4 * min(max(-float(logits[i, j]), -1.5), 1.5) if said else 0.0
+        assert got[i, j] == pytest.approx(want, abs=1e-6), (i, j)
+        count[int(known[i, j])] = count.get(int(known[i, j]), 0) + (want != 0)
+    assert count[FREE] > 20 and count[OCCUPIED] > 2
+    np.testing.assert_allclose(ask(observed(twist=(0.0, 0.0))), 0.2 * got, atol=1e-6)
+    blind = observed()._replace(image_valid=jnp.zeros(len(RIG.mounts), bool))
+    assert not ask(blind).any()  # LiDAR alone knows of neither
 
 
 @pytest.mark.parametrize("pose", POSES)
@@ -152,11 +180,12 @@ def test_answers_that_are_not_finite_weigh_nothing(params, monkeypatch):
 
     class Answered:
         dead = jnp.zeros(BEV.shape, jnp.float32).at[2, 4].set(jnp.nan).at[5, 9].set(jnp.inf).at[6, 3].set(-jnp.inf)
+        traversable = jnp.full(BEV.shape, jnp.nan)
 
     monkeypatch.setattr(fusion, "answer", lambda *_: Answered)
     local = window()._replace(occupancy=jnp.full(SHAPE, -2.0), seen=jnp.ones(SHAPE, bool))
     some = jax.device_get(fusion.predictor.__wrapped__(SPEC)(params, observed(POSES[0]), local))
-    assert np.isfinite(some.p_dead).all() and np.isfinite(some.confidence).all()
+    assert all(np.isfinite(field).all() for field in some)
     zero = np.zeros(BEV.shape, bool)
     zero[[2, 5, 6], [4, 9, 3]] = True
     for i in range(SHAPE[0]):

@@ -9,6 +9,7 @@ import pytest
 
 from drnav_jax.models import losses
 from drnav_jax.models.batch import BEFORE, NEVER, NOW, Targets
+from drnav_jax.models.bev import FREE, OCCUPIED, UNKNOWN
 from drnav_jax.models.losses import TERMS, LossParams
 from drnav_jax.models.network import Outputs
 
@@ -16,8 +17,9 @@ B, H, W = 4, 3, 5
 CLOSE = {"rtol": 2e-5, "atol": 1e-6}  # float32 sums of 60 numbers against float64
 PARAMS = LossParams(
     before=1.3, never=2.1, interior=3.7, gamma=1.6, unstable=0.3, path=0.7, flag=0.2, traversable=0.4, recoverability=0.6,
-    depth=0.9,
+    depth=0.9, hidden=4.5, veiled=2.5,
 )  # fmt: skip
+KNOWN = jnp.asarray(np.random.default_rng(3).choice([FREE, OCCUPIED, UNKNOWN], (B, H, W)), jnp.uint8)
 
 
 def case(seed=0):
@@ -64,7 +66,12 @@ def loop(p, out, t):
             weight *= 1 + p.interior * bool(t.interior[c])
             valid = float(t.valid[c])
             count("dead", (1 - right) ** p.gamma * bce(z, y), valid * weight)
-            count("traversable", bce(out.traversable[c], float(t.traversable[c])), float(t.inside[c]))
+            wrong = 1.0
+            if int(KNOWN[c]) == FREE and not bool(t.traversable[c]):
+                wrong = p.hidden
+            if int(KNOWN[c]) == OCCUPIED and bool(t.traversable[c]):
+                wrong = p.veiled
+            count("traversable", bce(out.traversable[c], float(t.traversable[c])), float(t.inside[c]) * wrong)
             count("recoverability", bce(out.recoverability[c], float(t.recoverability[c])), valid)
             off = abs(float(out.depth[c]) - math.log1p(float(t.depth[c])))
             count("depth", 0.5 * off**2 if off <= 0.5 else 0.5 * (off - 0.25), valid * y)
@@ -73,7 +80,7 @@ def loop(p, out, t):
 
 def test_terms_and_their_total_are_those_of_a_loop():
     out, targets = case()
-    terms, want = losses.sums(PARAMS, out, targets), loop(PARAMS, out, targets)
+    terms, want = losses.sums(PARAMS, out, targets, KNOWN), loop(PARAMS, out, targets)
     assert set(terms) == set(TERMS)
     for name in TERMS:
         assert want[name][1] > 0
@@ -88,10 +95,10 @@ def test_terms_and_their_total_are_those_of_a_loop():
 
 def test_without_gamma_it_is_cross_entropy():
     out, targets = case()
-    plain = losses.sums(PARAMS._replace(gamma=0.0), out, targets)["dead"]
+    plain = losses.sums(PARAMS._replace(gamma=0.0), out, targets, KNOWN)["dead"]
     want = loop(PARAMS._replace(gamma=0.0), out, targets)["dead"]
     np.testing.assert_allclose(plain, want, **CLOSE)
-    focal = losses.sums(PARAMS, out, targets)["dead"]
+    focal = losses.sums(PARAMS, out, targets, KNOWN)["dead"]
     assert float(focal[0]) < float(plain[0]) and float(focal[1]) == float(plain[1])
 
 
@@ -100,17 +107,18 @@ def test_two_halves_make_the_whole():
     out, targets = case()
     real = lambda tree: jax.tree.map(lambda a: a, tree)  # noqa: E731
     part = lambda tree, s: jax.tree.map(lambda a: a[s], real(tree))  # noqa: E731
-    whole, _ = losses.total(PARAMS, losses.sums(PARAMS, out, targets))
-    halves = [(part(out, s), part(targets, s)) for s in (slice(0, 1), slice(1, B))]  # of unequal size
+    whole, _ = losses.total(PARAMS, losses.sums(PARAMS, out, targets, KNOWN))
+    cuts = (slice(0, 1), slice(1, B))  # of unequal size
+    halves = [(part(out, s), part(targets, s), KNOWN[s]) for s in cuts]
     weights = [{n: w for n, (_, w) in losses.sums(PARAMS, *h).items()} for h in halves]
     over = {n: weights[0][n] + weights[1][n] for n in TERMS}
     values = [losses.total(PARAMS, losses.sums(PARAMS, *h), over)[0] for h in halves]
     np.testing.assert_allclose(float(values[0] + values[1]), float(whole), **CLOSE)
 
-    def loss(out, targets, over=None):
-        return losses.total(PARAMS, losses.sums(PARAMS, out, targets), over)[0]
+    def loss(out, targets, known, over=None):
+        return losses.total(PARAMS, losses.sums(PARAMS, out, targets, known), over)[0]
 
-    slope = jax.grad(loss)(out, targets)
+    slope = jax.grad(loss)(out, targets, KNOWN)
     parts = [jax.grad(loss)(*h, over) for h in halves]
     joined = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **CLOSE), joined, slope)
@@ -121,9 +129,9 @@ def test_nothing_to_learn_from_is_a_loss_of_zero():
     none = targets._replace(
         valid=jnp.zeros((B, H, W), bool), inside=jnp.zeros((B, H, W), bool), dead_end=jnp.zeros((B, H, W), bool)
     )
-    _, each = losses.total(PARAMS, losses.sums(PARAMS, out, none))
+    _, each = losses.total(PARAMS, losses.sums(PARAMS, out, none, KNOWN))
     assert [float(each[n]) for n in ("dead", "traversable", "recoverability", "depth")] == [0, 0, 0, 0]
-    slope = jax.grad(lambda o: losses.total(PARAMS, losses.sums(PARAMS, o, none))[0])(out)
+    slope = jax.grad(lambda o: losses.total(PARAMS, losses.sums(PARAMS, o, none, KNOWN))[0])(out)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slope)) and not np.asarray(slope.dead).any()
 
 
@@ -133,7 +141,7 @@ def test_sure_and_wrong_or_sure_and_right_is_finite(gamma):
     right = jnp.where(jnp.arange(W) % 2 == 0, 80.0, -80.0)[None, None]
     sure = out._replace(dead=jnp.where(targets.dead_end, 1.0, -1.0) * right)
     params = PARAMS._replace(gamma=gamma)
-    value, slope = jax.value_and_grad(lambda o: losses.total(params, losses.sums(params, o, targets))[0])(sure)
+    value, slope = jax.value_and_grad(lambda o: losses.total(params, losses.sums(params, o, targets, KNOWN))[0])(sure)
     assert np.isfinite(value) and np.isfinite(slope.dead).all()
     pulled = np.asarray(slope.dead)[np.asarray(targets.valid)]
     assert np.abs(pulled).max() > 0
@@ -144,7 +152,7 @@ def test_weights_of_the_loss_can_be_swept():
 
     def loss(interior):
         params = PARAMS._replace(interior=interior)
-        return losses.total(params, losses.sums(params, out, targets))[0]
+        return losses.total(params, losses.sums(params, out, targets, KNOWN))[0]
 
     many = jax.vmap(loss)(jnp.asarray([0.0, 4.0], jnp.float32))
     assert abs(float(many[0] - many[1])) > 1e-3

@@ -30,13 +30,14 @@ class Run:
         self.state = recovery.init(SPEC, f32(xy))
         self.modes = []  # [(mode, ticks it lasted)]
 
-    def tick(self, xy=None, free=True, way=True, refuge=(2.0, 0.0), has_refuge=True):
+    def tick(self, xy=None, free=True, way=True, refuge=(2.0, 0.0), has_refuge=True, risky=False, ahead=(1.0, 1.0)):
         before = self.xy
         self.xy = self.xy if xy is None else np.array(xy, np.float32)
+        self.state = self.state._replace(refuge=f32(refuge), has_refuge=jnp.asarray(has_refuge))
         self.state = update(
             spec=SPEC, params=self.params, state=self.state, time=f32(self.time), dt=DT, xy=f32(self.xy),
             driven=f32(np.hypot(*(self.xy - before))), origin=f32(ORIGIN), candidate_free=jnp.asarray(free),
-            has_way=jnp.asarray(way), refuge=f32(refuge), has_refuge=jnp.asarray(has_refuge),
+            has_way=jnp.asarray(way), risky=jnp.asarray(risky), ahead=f32(ahead),
         )  # fmt: skip
         self.time += DT
         if self.modes and self.modes[-1][0] == self.mode:
@@ -224,18 +225,23 @@ def test_waiting_is_not_being_stuck():
     assert run.until(CLEAR) == pytest.approx(PARAMS.stuck_time, abs=3 * DT), "then the clocks begin"
 
 
-def test_the_refuge_is_open_near_and_not_yet_visited():
-    points = f32([[2.0, 0.0], [0.0, 4.0], [0.3, 0.0], [-3.0, 0.0]])
-    rank, valid = f32([2, 5, 6, 2]), jnp.asarray([True, True, True, True])
+def test_it_turns_back_before_what_it_takes_for_a_dead_end():
+    run = Run()
+    for k in range(30):  # risky now and then, as one false alarm makes it: drive on
+        assert run.tick(xy=(0.1 * k - 3, 0.0), risky=k % 5 != 4) == DRIVE
+    assert not bool(recovery.looking(run.state, f32(run.time - DT))), "calm: nothing to rank"
+    run.tick(xy=(0.1, 0.0), risky=True)
+    assert bool(recovery.looking(run.state, f32(run.time - DT)))
+    assert run.until(RETREAT, xy=(0.1, 0.0), risky=True, ahead=(3.0, 1.0), refuge=(-2.0, 1.0)) < PARAMS.risky_time + 3 * DT
+    assert [m for m, _ in run.modes] == [DRIVE, RETREAT], "no clearing: it is not stuck"
+    np.testing.assert_allclose(run.state.target, [-2.0, 1.0])
+    assert visit(run.state, 3.0, 1.0) == 1.0 and visit(run.state, 0.1, 0.1) < 1.0, "what lies ahead is what is avoided"
 
-    def choose(rank=rank, valid=valid, visits=(0, 0, 0, 0)):
-        xy, found = recovery.choose(PARAMS, points, rank, valid, f32(visits), f32([0.0, 0.0]))
-        return tuple(map(float, xy)), bool(found)
 
-    assert choose() == ((0.0, 4.0), True)  # 5 - 4 against 2 - 2 and 2 - 3; the nearest is too near
-    assert choose(visits=(0, 1, 0, 0)) == ((2.0, 0.0), True)
-    assert choose(valid=jnp.asarray([False, False, True, True])) == ((-3.0, 0.0), True)
-    assert choose(valid=jnp.asarray([False, False, True, False])) == ((0.0, 0.0), False)
+def test_without_a_refuge_a_risky_way_is_taken():
+    run = Run()
+    for k in range(60):
+        assert run.tick(xy=(0.1 * k - 3, 0.0), risky=True, has_refuge=False) == DRIVE
 
 
 def test_one_trace_and_a_batch_equals_single_calls():
@@ -245,7 +251,7 @@ def test_one_trace_and_a_batch_equals_single_calls():
         return dict(
             state=recovery.init(SPEC, f32([0, 0])), time=f32(3.0 * k), dt=f32(0.1), xy=f32([0.2 * k, 0]),
             driven=f32(0.1 * k), origin=f32(ORIGIN), candidate_free=jnp.asarray(k == 1), has_way=jnp.asarray(k != 2),
-            refuge=f32([1, 1]), has_refuge=jnp.asarray(True), params=PARAMS._replace(stuck_time=f32(4.0 + k)),
+            risky=jnp.asarray(False), ahead=f32([1, 1]), params=PARAMS._replace(stuck_time=f32(4.0 + k)),
         )  # fmt: skip
 
     one = [once(SPEC, **args(k)) for k in range(3)]
