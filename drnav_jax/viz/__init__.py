@@ -3,6 +3,10 @@
 from drnav_jax.viz.animation import Frame, belief
 from drnav_jax.viz.look import MissingExtra
 from drnav_jax.viz.pictures import trajectories
+from drnav_jax.viz.recordings import Predicted, predictions
 from drnav_jax.viz.worldview import TopView, Truth, gallery, samples, world
 
-__all__ = ["Frame", "MissingExtra", "TopView", "Truth", "belief", "gallery", "samples", "trajectories", "world"]
+__all__ = [
+    "Frame", "MissingExtra", "Predicted", "TopView", "Truth", "belief", "gallery", "predictions", "samples", "trajectories",
+    "world",
+]  # fmt: skip
