@@ -74,7 +74,8 @@ class Config:
         """Check counts."""
         if self.frames < 0 or min(self.columns, self.repeats) < 1:
             raise ValueError(
-                f"--frames must be >= 0, --columns and --repeats >= 1, got {self.frames}, {self.columns} and {self.repeats}."
+                f"--frames must be >= 0, --columns and --repeats >= 1, got {self.frames}, {self.columns} and "
+                f"{self.repeats}."
             )
 
 
@@ -175,7 +176,7 @@ def picture(frame: bags.Recorded, said: Said, number: int, since: float) -> viz.
     seen = frame.observation
     return viz.Predicted(
         title=f"{number + 1}   {frame.time - since:.1f} s", photos=[p for p in frame.photos if p is not None],
-        views=seen.images, cloud=frame.cloud, points=np.asarray(seen.points)[np.asarray(seen.point_valid)],
+        cloud=frame.cloud, points=np.asarray(seen.points)[np.asarray(seen.point_valid)],
         local_map=np.asarray(said.known), judged=np.asarray(said.judged), p_dead=np.asarray(said.p_dead),
         traversable=np.asarray(said.traversable), p_open=_logistic(said.path), p_flag=float(_logistic(said.flag)),
     )  # fmt: skip
@@ -215,10 +216,10 @@ def main(config: Config) -> dict[str, Any]:
             "ground_tilt_deg": None if ground is None else math.degrees(ground.tilt), "latency_ms": float(np.median(times)),
         })  # fmt: skip
         drawn.append(picture(frame, said, k, recorded[0].time))
-        viz.predictions(config.out / f"frame{k + 1:02d}.png", drawn[-1:], spec.bev.origin, spec.bev.resolution, note=config.note)
-    viz.predictions(
-        config.out / "frames.png", drawn, spec.bev.origin, spec.bev.resolution, columns=config.columns, note=config.note
-    )
+    draw = partial(viz.predictions, origin=spec.bev.origin, resolution=spec.bev.resolution, note=config.note)
+    for k, frame in enumerate(drawn):
+        draw(config.out / f"frame{k + 1:02d}.png", [frame])
+    draw(config.out / "frames.png", drawn, columns=config.columns)
     result = {
         "experiment": "real_frames", "data": config.data.name, "weights_sha256": trained.sha256,
         "image": {"shape": list(config.shape), "fov_deg": config.fov}, "summary": summary(rows, spent), "frames": rows,

@@ -55,7 +55,8 @@ class Maker:
 
     def cloud(self, ns, points, frame="lidar"):
         points = np.asarray(points, np.float32)
-        fields = [self.new("sensor_msgs/msg/PointField", name=n, offset=4 * k, datatype=7, count=1) for k, n in enumerate("xyz")]
+        field = lambda k, n: self.new("sensor_msgs/msg/PointField", name=n, offset=4 * k, datatype=7, count=1)  # noqa: E731
+        fields = [field(k, n) for k, n in enumerate("xyz")]
         return self.new(
             "sensor_msgs/msg/PointCloud2", header=self.header(ns, frame), height=1, width=len(points), fields=fields,
             is_bigendian=False, point_step=12, row_step=12 * len(points), data=np.frombuffer(points.tobytes(), np.uint8),
@@ -136,7 +137,7 @@ def drive(count: int = 3, ros: int = 2, every: int = 100_000_000, without=(), **
         ros: 1 or 2.
         every: Step [ns].
         without: Topics that are left out.
-        changes: In place of a topic's messages: "points", "image", "info", "odometry", "tf" -> function of (maker, number, ns).
+        changes: "points", "image", "info", "odometry" or "tf": what makes a message from (maker, number, ns).
     """
     make = Maker(ros)
     usual = {

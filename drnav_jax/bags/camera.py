@@ -1,7 +1,7 @@
 """Recorded images as those of the cameras that the network knows: small, pinhole, level.
 
-The new camera stands at the optical centre of the real one and looks the same way along the ground, so what it sees is a matter
-of directions alone. Through the middle of each new pixel goes a ray
+The new camera stands at the optical centre of the real one and looks the same way along the ground, so what it sees is a
+matter of directions alone. Through the middle of each new pixel goes a ray
 
     d = R_realᵀ R_new ((u - c) / f, 1)                                                                    (1)
 
@@ -81,7 +81,8 @@ def decoded(message: Any) -> UInt8[np.ndarray, "rows columns 3"]:
         except (OSError, SyntaxError) as error:
             raise ValueError(f"a compressed image ({message.format}) is damaged or no JPEG or PNG: {error}.") from None
     if message.encoding not in _CHANNELS:
-        raise ValueError(f'encoding "{message.encoding}" cannot be read: record one of {", ".join(_CHANNELS)}, or compressed.')
+        known = ", ".join(_CHANNELS)
+        raise ValueError(f'encoding "{message.encoding}" cannot be read: record one of {known}, or compressed images.')
     depth, data = _DEPTH[message.encoding], np.asarray(message.data, np.uint8)
     if message.step < message.width * depth or data.size < message.height * message.step:
         raise ValueError(f"an image of {message.height} x {message.width} has only {data.size} bytes: it is cut off.")
@@ -182,8 +183,8 @@ def redrawn(spec: ImageSpec, lens: Lens, put: Rigid, image: UInt8[np.ndarray, "r
     """
     if image is not None and image.shape[:2] != lens.shape:
         raise ValueError(
-            f"the image has {image.shape[0]} x {image.shape[1]} pixels, its CameraInfo is for {lens.shape[0]} x {lens.shape[1]}: "
-            "record the CameraInfo of this resolution."
+            f"the image has {image.shape[0]} x {image.shape[1]} pixels, its CameraInfo is for {lens.shape[0]} x "
+            f"{lens.shape[1]}: record the CameraInfo of this resolution."
         )
     along = put.rotation[:, 2]
     mount = Mount(yaw=math.atan2(along[1], along[0]), fov=spec.fov)

@@ -13,13 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drnav_jax.bags import camera, scan, sync, transforms
-from drnav_jax.bags.camera import ImageSpec, Lens
+from drnav_jax.bags.camera import ImageSpec, Lens, View
 from drnav_jax.bags.reader import Bag, Message, chosen, listing, messages, opened
 from drnav_jax.bags.scan import Ground, ScanSpec
 from drnav_jax.bags.transforms import IDENTITY, Rigid, Tree
 from drnav_jax.types import CameraRig, Observation
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+_RIG = {"focal": (2,), "centre": (2,), "position": (3,), "rotation": (3, 3)}  # shapes of a camera's `CameraRig`
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 
@@ -104,7 +105,8 @@ def _sensors(bag: Bag, spec: BagSpec) -> _Sensors:
     for image, info in infos.items():
         if bag.kinds.get(info) != camera.INFO or not bag.counts[info]:
             raise ValueError(
-                f"{bag.path} has no calibration for {image}: record {info} (sensor_msgs/msg/CameraInfo) too, or name other images."
+                f"{bag.path} has no calibration for {image}: record {info} (sensor_msgs/msg/CameraInfo) too, or name "
+                "other images."
             )
     first: dict[str, Any] = {}
     for message in messages(bag, {*seeing, *infos.values()}):
@@ -119,7 +121,7 @@ def _sensors(bag: Bag, spec: BagSpec) -> _Sensors:
 def _mounts(bag: Bag, spec: BagSpec, frames: dict[str, str]) -> dict[str, Rigid]:
     tree, base = Tree(), spec.base_frame.lstrip("/")
     raised = Rigid(np.eye(3), np.array([0.0, 0.0, spec.base_height]))
-    apart = lambda: [frame for frame in frames.values() if frame != base and tree.between(base, frame) is None]  # noqa: E731
+    apart = lambda: [f for f in frames.values() if f != base and tree.between(base, f) is None]  # noqa: E731
     if apart():
         for message in messages(bag, [name for name, kind in bag.kinds.items() if kind in TRANSFORMS]):
             tree.add(message.content)
@@ -127,8 +129,9 @@ def _mounts(bag: Bag, spec: BagSpec, frames: dict[str, str]) -> dict[str, Rigid]
                 break
     if missing := apart():
         raise ValueError(
-            f'{bag.path} does not say where "{missing[0]}" sits on "{base}" (tf knows {", ".join(tree.frames()) or "no frames"}): '
-            "record /tf_static too, or give the frame that stands for base_link as base_frame."
+            f'{bag.path} does not say where "{missing[0]}" sits on "{base}" (tf knows '
+            f"{', '.join(tree.frames()) or 'no frames'}): record /tf_static too, or give the frame that stands for base_link "
+            "as base_frame."
         )
     put = {frame: IDENTITY if frame == base else tree.between(base, frame) for frame in frames.values()}
     return {name: raised @ (put[frame] or IDENTITY) for name, frame in frames.items()}
@@ -170,17 +173,19 @@ def _recorded(spec: BagSpec, sensors: _Sensors, held: dict[str, Message | None],
         camera.redrawn(spec.image, sensors.lenses[name], levelled @ sensors.mounts[name], photo)
         for name, photo in zip(sensors.images, photos, strict=True)
     ]
-    stacked = lambda field, shape: np.stack([getattr(v, field) for v in views]) if views else np.zeros((0, *shape), np.float32)  # noqa: E731
-    rig: dict[str, Any] = {name: stacked(name, (3, 3) if name == "rotation" else (3,) if name == "position" else (2,))
-                           for name in CameraRig._fields}  # fmt: skip
+    rig: dict[str, Any] = {name: _stacked(views, name, shape) for name, shape in _RIG.items()}
     pose, twist = _odometry(spec, sensors, held)
     fields: dict[str, Any] = {
-        "images": stacked("image", (*spec.image.shape, 3)), "image_valid": np.array([p is not None for p in photos], bool),
+        "images": _stacked(views, "image", (*spec.image.shape, 3)), "image_valid": np.array([p is not None for p in photos], bool),
         "points": scanned.points, "point_valid": scanned.valid, "pose": pose, "twist": twist,
         "goal": np.zeros(2, np.float32), "image_age": np.array([age(m) for m in shown], np.float32),
         "point_age": np.float32(age(lidar)), "rig": CameraRig(**rig),
     }  # fmt: skip
     return Recorded(Observation(**fields), time * 1e-9, photos, cloud.astype(np.float32), found)
+
+
+def _stacked(views: list[View], field: str, shape: tuple[int, ...]) -> np.ndarray:
+    return np.stack([getattr(view, field) for view in views]) if views else np.zeros((0, *shape), np.float32)
 
 
 def _odometry(spec: BagSpec, sensors: _Sensors, held: dict[str, Message | None]) -> tuple[np.ndarray, np.ndarray]:

@@ -8,6 +8,8 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+_MEND = "if the recording was cut off, mend it with `rosbag reindex` (ROS 1) or `ros2 bag reindex`"
+
 
 class Message(NamedTuple):
     """One message, as `rosbags` deserialises it."""
@@ -30,7 +32,7 @@ def _absent(bag: Path) -> str:
     if not bag.exists():
         return "it is not there"
     if bag.is_dir() and not (bag / "metadata.yaml").is_file():
-        return "the folder holds no metadata.yaml: give the folder that `ros2 bag record` wrote (`ros2 bag reindex` mends it)"
+        return "the folder holds no metadata.yaml: give the one that `ros2 bag record` wrote, or mend it by `ros2 bag reindex`"
     return ""
 
 
@@ -56,7 +58,10 @@ def opened(path: str | Path) -> Iterator[Bag]:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()
     except Exception as error:  # what a broken file raises depends on where it breaks
-        raise ValueError(f"{path} cannot be read as a rosbag ({_first_line(error)}): is the recording complete?") from error
+        raise ValueError(
+            f"{path} cannot be read as a rosbag ({_said(error)}): {_MEND}; topics of odd types can be left out with "
+            "`rosbags-convert`."
+        ) from error
     try:
         topics = reader.topics
         yield Bag(
@@ -66,8 +71,9 @@ def opened(path: str | Path) -> Iterator[Bag]:
         reader.close()
 
 
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+def _said(error: Exception) -> str:
+    """What an error says, on one line that is not too long."""
+    return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 def _time(content: Any, recorded: int) -> int:
@@ -95,10 +101,7 @@ def messages(bag: Bag, topics: Collection[str]) -> Iterator[Message]:
         except StopIteration:
             return
         except Exception as error:  # as above
-            raise ValueError(
-                f"{bag.path} is broken ({_first_line(error)}): mend it with `rosbag reindex` (ROS 1) or `ros2 bag reindex`, "
-                "or record it again."
-            ) from error
+            raise ValueError(f"{bag.path} is broken ({_said(error)}): {_MEND}, or record it again.") from error
         yield Message(connection.topic, _time(content, recorded), content)
 
 
@@ -128,7 +131,8 @@ def chosen(bag: Bag, wanted: str | None, kinds: Collection[str], what: str) -> s
         raise ValueError(f"{bag.path} has no topic {wanted} for {what}; it has {listing(bag)}.")
     if bag.kinds[wanted] not in kinds:
         raise ValueError(
-            f"{wanted} is of type {bag.kinds[wanted]}, which is no {what}: name a topic of type {' or '.join(sorted(kinds))}."
+            f"{wanted} is of type {bag.kinds[wanted]}, which is no {what}: name a topic of type "
+            f"{' or '.join(sorted(kinds))}."
         )
     if not bag.counts[wanted]:
         raise ValueError(f"{bag.path} holds no message on {wanted}: was the {what} running?")

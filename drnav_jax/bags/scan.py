@@ -1,8 +1,8 @@
 """Clouds and scans as the points of an observation.
 
-A cloud of more points than a scan holds is seen by the LiDAR of a `ScanSpec` standing where it does: of all points whose
-bearing and elevation from there fall to one of its beams, the nearest is that beam's return. So whatever LiDAR recorded it, the
-cloud comes with the density and the field of view that the network was trained on.
+A cloud of more points than a scan holds is given as the LiDAR of a `ScanSpec` would see it: of all points whose bearing and
+elevation from there fall to one of its beams, the nearest is that beam's return. So whatever LiDAR recorded it, the cloud
+comes with the density and the field of view that the network was trained on.
 """
 
 import dataclasses
@@ -16,6 +16,9 @@ from drnav_jax.bags.transforms import Rigid
 
 CLOUD, LASER = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/LaserScan"
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
+_REACH = 15.0  # [m] of `level`: the ground is not flat for ever
+_WITHIN = (0.4, 0.2, 0.1, 0.1)  # [m] of the plane so far, so that walls and kerbs drop out one after the other
+_AGREEING = 100  # points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,8 +150,3 @@ def level(points: Float[np.ndarray, "n 3"]) -> Ground | None:
     ahead /= np.linalg.norm(ahead)
     turn = np.stack([ahead, np.cross(up, ahead), up])
     return Ground(Rigid(turn, -turn @ np.array([0.0, 0.0, plane[2]])), float(plane[2]), float(np.arccos(up[2])))
-
-
-_REACH = 15.0  # [m] the ground is not flat for ever
-_WITHIN = (0.4, 0.2, 0.1, 0.1)  # [m] of the plane so far, so that walls and kerbs drop out one after the other
-_AGREEING = 100  # points

@@ -32,12 +32,13 @@ def matched(
     waiting: deque[Message] = deque()
     held: dict[str, deque[Message]] = {name: deque() for name in others}
 
-    def done(first: Message, newest: int) -> tuple[Message, dict[str, Message | None]]:
-        found = {name: _nearest(messages, first.time, tolerance) for name, messages in held.items()}
-        for messages in held.values():  # what lies before the next reference's window is of no use any more
-            while len(messages) > 1 and messages[1].time <= first.time:
+    def done(first: Message) -> tuple[Message, dict[str, Message | None]]:
+        return first, {name: _nearest(messages, first.time, tolerance) for name, messages in held.items()}
+
+    def forget(before: int) -> None:  # of what lies before that time only the last may still be the nearest
+        for messages in held.values():
+            while len(messages) > 1 and messages[1].time <= before:
                 messages.popleft()
-        return first, found
 
     newest = 0
     for message in stream:
@@ -51,6 +52,8 @@ def matched(
             complete = all(messages and messages[-1].time >= time for messages in held.values())
             if not complete and newest < time + PATIENCE:
                 break
-            yield done(waiting.popleft(), newest)
+            yield done(waiting.popleft())
+            forget(time)
+        forget(newest - PATIENCE)
     while waiting:
-        yield done(waiting.popleft(), newest)
+        yield done(waiting.popleft())

@@ -69,20 +69,21 @@ def test_the_scene_stays_where_it_is(model, d):
     info = Maker().info(0, SHAPE, focal=100.0, d=d, model=model)
     rotation = Rotation.from_euler("ZYX", [0.5, 0.1, 0.05]).as_matrix() @ LOOKS  # turned left, down, and rolled
     photo = photographed(info, rotation, model, d)
-    view = camera.redrawn(ImageSpec((24, 32), 1.5), camera.lens_of(info, False), Rigid(rotation, np.array([1.0, 2, 3])), photo)
+    put = Rigid(rotation, np.array([1.0, 2.0, 3.0]))
+    view = camera.redrawn(ImageSpec((24, 32), 1.5), camera.lens_of(info, False), put, photo)
     # level, and where the real camera looks along the ground
     along = rotation[:, 2]
-    np.testing.assert_allclose(view.rotation[:, 2], [along[0] / np.hypot(*along[:2]), along[1] / np.hypot(*along[:2]), 0], atol=1e-6)
+    np.testing.assert_allclose(view.rotation[:, 2], [*(along[:2] / np.hypot(*along[:2])), 0], atol=1e-6)
     np.testing.assert_allclose(view.rotation[:, 1], [0, 0, -1], atol=1e-6)
     np.testing.assert_allclose(view.position, [1, 2, 3])
     compared = 0
     for i in range(24):
         for j in range(32):
-            ray = view.rotation @ [(j + 0.5 - view.centre[0]) / view.focal[0], (i + 0.5 - view.centre[1]) / view.focal[1], 1.0]
+            ray = view.rotation @ [*(([j + 0.5, i + 0.5] - view.centre) / view.focal), 1.0]
             x, y, z = rotation.T @ ray
             u, v = np.array(bent(model, d, x / z, y / z)) * 100.0 + [info.k[2], info.k[5]] if z > 0.1 else (-99.0, -99.0)
             if 6 < u < SHAPE[1] - 7 and 6 < v < SHAPE[0] - 7:
-                np.testing.assert_allclose(view.image[i, j], colour(ray), atol=0.02)  # 1/255, and a pixel's width of the scene
+                np.testing.assert_allclose(view.image[i, j], colour(ray), atol=0.02)  # a pixel's width of the scene
                 assert view.seen[i, j]
                 compared += 1
             elif not (-1 < u < SHAPE[1] and -1 < v < SHAPE[0]):

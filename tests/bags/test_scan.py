@@ -18,8 +18,8 @@ def test_clouds_of_any_layout():
     for row in points.reshape(2, 3, 3):
         held = b"".join(b"\x07" + p.astype(">f8").tobytes() + b"\x00" * 3 for p in row)
         rows.append(held + b"\xff" * 5)
-    fields = [make.new("sensor_msgs/msg/PointField", name=n, offset=1 + 8 * k, datatype=8, count=1) for k, n in enumerate("xyz")]
-    fields.insert(0, make.new("sensor_msgs/msg/PointField", name="intensity", offset=0, datatype=2, count=1))
+    places = (("intensity", 0, 2), ("x", 1, 8), ("y", 9, 8), ("z", 17, 8))
+    fields = [make.new("sensor_msgs/msg/PointField", name=n, offset=at, datatype=t, count=1) for n, at, t in places]
     odd = make.new(
         "sensor_msgs/msg/PointCloud2", header=make.header(0, "lidar"), height=2, width=3, fields=fields, is_bigendian=True,
         point_step=28, row_step=28 * 3 + 5, data=np.frombuffer(b"".join(rows), np.uint8), is_dense=False,
