@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
+STORES[1].register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
 IMAGE, INFO, POINTS, SCAN, ODOM, TF = "/cam/image", "/cam/camera_info", "/points", "/scan", "/odom", "/tf_static"
 PHOTO = (40, 60)  # rows, columns
 BEGIN = 100_000_000_000  # [ns]
