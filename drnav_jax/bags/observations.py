@@ -130,8 +130,8 @@ def _mounts(bag: Bag, spec: BagSpec, frames: dict[str, str]) -> dict[str, Rigid]
     if missing := apart():
         raise ValueError(
             f'{bag.path} does not say where "{missing[0]}" sits on "{base}" (tf knows '
-            f"{', '.join(tree.frames()) or 'no frames'}): record /tf_static too, or give the frame that stands for base_link "
-            "as base_frame."
+            f"{', '.join(tree.frames()) or 'no frames'}): record /tf_static too, or give the frame that stands for "
+            "base_link as base_frame."
         )
     put = {frame: IDENTITY if frame == base else tree.between(base, frame) for frame in frames.values()}
     return {name: raised @ (put[frame] or IDENTITY) for name, frame in frames.items()}
@@ -176,7 +176,8 @@ def _recorded(spec: BagSpec, sensors: _Sensors, held: dict[str, Message | None],
     rig: dict[str, Any] = {name: _stacked(views, name, shape) for name, shape in _RIG.items()}
     pose, twist = _odometry(spec, sensors, held)
     fields: dict[str, Any] = {
-        "images": _stacked(views, "image", (*spec.image.shape, 3)), "image_valid": np.array([p is not None for p in photos], bool),
+        "images": _stacked(views, "image", (*spec.image.shape, 3)),
+        "image_valid": np.array([photo is not None for photo in photos], bool),
         "points": scanned.points, "point_valid": scanned.valid, "pose": pose, "twist": twist,
         "goal": np.zeros(2, np.float32), "image_age": np.array([age(m) for m in shown], np.float32),
         "point_age": np.float32(age(lidar)), "rig": CameraRig(**rig),

@@ -32,7 +32,7 @@ def _absent(bag: Path) -> str:
     if not bag.exists():
         return "it is not there"
     if bag.is_dir() and not (bag / "metadata.yaml").is_file():
-        return "the folder holds no metadata.yaml: give the one that `ros2 bag record` wrote, or mend it by `ros2 bag reindex`"
+        return "the folder has no metadata.yaml: give the one that `ros2 bag record` wrote, or run `ros2 bag reindex`"
     return ""
 
 

@@ -45,7 +45,7 @@ def photographed(info, rotation, model, d):
             if model == "equidistant":
                 r = math.hypot(u, v)
                 top = max(1e-9, r)
-                slope = brentq(lambda s: bent(model, d, s, 0)[0] - top, 0, 50) if r else 0.0
+                slope = brentq(lambda s, top=top: bent(model, d, s, 0)[0] - top, 0, 50) if r else 0.0
                 x, y = (u / top * slope, v / top * slope)
             else:
                 x, y = u, v
