@@ -19,7 +19,7 @@ from drnav_jax.worlds.truth import truth
 CAMERAS = ("front", "left", "right")
 PIXELS = 288  # of an image
 MARGIN = 0.33  # [m] from the robot's centre to the walls on the shortest way
-BEFORE = 4.0  # [m] by way before the place where twins differ: there a camera looks at it
+BEFORE = 2.5  # [m] by way before the place where twins differ: there a camera looks at it
 
 
 def _outlines(scene: Scene) -> list[np.ndarray]:

@@ -100,11 +100,12 @@ def train(
         progress: Called with the steps done and the latest figures.
 
     Raises:
-        ValueError: If `out` holds another run, or there is nothing to resume.
+        ValueError: If `out` holds another run, there is nothing to resume, or nothing to start from.
+        OSError: If the weights to start from cannot be read.
     """
+    state = init(spec)
     _begin(out, spec, resume)
     mesh = mesh_of(jax.devices() if devices is None else devices, spec.batch_size)
-    state = init(spec)
     kept = Checkpoints(out, spec.keep)
     if resume and kept.latest is not None:
         state = kept.load(state)

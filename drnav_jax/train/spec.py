@@ -27,6 +27,7 @@ class TrainSpec:
         clip: Largest norm of a gradient.
         ema: Decay of the average of the parameters, which is what is shipped.
         seed: Of parameters, order and augmentation.
+        start_from: File of weights of the same network to go on from; "" = random ones.
         validate_every: Steps between two validations.
         save_every: Steps between two checkpoints.
         keep: Checkpoints kept, beside the best.
@@ -43,6 +44,7 @@ class TrainSpec:
     clip: float = 1.0
     ema: float = 0.998
     seed: int = 0
+    start_from: str = ""
     validate_every: int = 1000
     save_every: int = 250
     keep: int = 2

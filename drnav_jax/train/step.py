@@ -6,6 +6,7 @@
 
 import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ import optax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
-from drnav_jax.models import losses, network
+from drnav_jax.models import losses, network, weights
 from drnav_jax.models.batch import Batch
 from drnav_jax.train.augment import augment
 from drnav_jax.train.spec import TrainSpec
@@ -44,8 +45,16 @@ def optimiser(spec: TrainSpec) -> optax.GradientTransformation:
 
 
 def init(spec: TrainSpec) -> TrainState:
-    """Before the first step."""
-    params = network.init(jax.random.key(spec.seed), spec.network)
+    """Before the first step.
+
+    Raises:
+        ValueError: If the weights to start from are damaged, or of another network.
+        OSError: If they cannot be read.
+    """
+    if spec.start_from:
+        params = jax.tree.map(jnp.asarray, weights.load(Path(spec.start_from), spec.network).params)
+    else:
+        params = network.init(jax.random.key(spec.seed), spec.network)
     average = jax.tree.map(jnp.copy, params)  # a buffer of its own: steps give their state's buffers away
     return TrainState(jnp.zeros((), jnp.int32), params, average, optimiser(spec).init(params))
 

@@ -1,5 +1,6 @@
 """A whole training run: killed and resumed it ends in the same bits, and it refuses what is not its own."""
 
+import dataclasses
 import json
 
 import jax
@@ -111,6 +112,21 @@ def test_a_finished_run_may_be_resumed_and_changes_nothing(whole, validation):
     before = weights.load(whole[0] / "weights.safetensors").sha256
     result = run(whole[0], validation, resume=True)
     assert weights.load(whole[0] / "weights.safetensors").sha256 == before and result.step == whole[1].step
+
+
+def test_it_goes_on_from_weights(validation, tmp_path, whole):
+    """They are where it begins; a rate of almost nothing leaves them as they are."""
+    file = whole[0] / "weights.safetensors"
+    held = weights.load(file)
+    still = dataclasses.replace(TRAIN, start_from=str(file), learning_rate=1e-12, steps=1, weight_decay=0.0)
+    result = run(tmp_path / "on", validation, spec=still)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), result.params, held.params)
+    other = dataclasses.replace(still, network=dataclasses.replace(LEAST, bev=dataclasses.replace(LEAST.bev, ahead=0.3)))
+    with pytest.raises(ValueError, match="another bev"):
+        run(tmp_path / "other", validation, spec=other)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        run(tmp_path / "none", validation, spec=dataclasses.replace(still, start_from=str(tmp_path / "nowhere")))
+    assert not (tmp_path / "other").exists() and not (tmp_path / "none").exists(), "nothing was begun"
 
 
 def test_it_refuses_what_is_not_its_own(whole, validation, tmp_path):
