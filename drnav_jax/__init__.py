@@ -6,7 +6,7 @@
 Pure, jittable functions for one robot; the caller vmaps. The parts are in the subpackages.
 """
 
-from drnav_jax import evaluate, filter, geometry, grids, metrics, models, navigator, planning, sim, types, worlds
+from drnav_jax import bags, evaluate, filter, geometry, grids, metrics, models, navigator, planning, sim, types, worlds
 from drnav_jax.navigator import Info, NavParams, NavSpec, NavState, init, step
 from drnav_jax.types import (
     BevSpec,
@@ -42,6 +42,7 @@ __all__ = [
     "Observation",
     "RigSpec",
     "RobotParams",
+    "bags",
     "empty_observation",
     "evaluate",
     "filter",

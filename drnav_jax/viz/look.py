@@ -8,7 +8,8 @@ falls from yellow to red, so that the order survives in print and for colour-bli
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple, SupportsFloat, TypeAlias
+from pathlib import Path
+from typing import Any, NamedTuple, SupportsFloat, TypeAlias
 
 import numpy as np
 from jaxtyping import Array
@@ -16,6 +17,7 @@ from jaxtyping import Array
 Numbers: TypeAlias = np.ndarray | Array | Sequence  # a grid, points or one point, from wherever they come
 Number: TypeAlias = SupportsFloat
 
+DPI = 110  # of pages
 PRIOR = 0.06  # base rate of dead-end cells; the default of the filter
 FULL_AT = 1.5  # [nat] from the prior at which the heat is fully opaque
 DEAD_OPACITY, OPEN_OPACITY = 0.75, 0.45  # a warning may shout, the rest is ground
@@ -148,3 +150,26 @@ class MissingExtra(ImportError):
     def __init__(self) -> None:
         """Say what to do."""
         super().__init__("pictures need the extra: pip install drnav_jax[viz]")
+
+
+def page(width: float, height: float) -> Any:
+    """An empty figure [inch].
+
+    Raises:
+        MissingExtra: If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtra from error
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Any, file: Path) -> Path:
+    """Write a figure without the white around it; folders are made."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, bbox_inches="tight")
+    return file

@@ -12,7 +12,6 @@ import numpy as np
 from drnav_jax.viz import look
 from drnav_jax.viz.look import Numbers
 
-DPI = 110
 # Name of a material -> (edge colour, hatch) in top views; others are drawn without.
 HATCHES: dict[str, tuple[str, str]] = {
     "GLASS": ("#0077b6", "////"), "BUSH": ("#1b5e20", "xxx"), "GRASS": ("#7cb342", "..."), "DROP": ("#000000", "\\\\\\\\"),
@@ -46,21 +45,6 @@ class Truth(NamedTuple):
     depth: Numbers  # [H, W] beyond the mouth, 0 where it is no dead end [m]
     gates: Numbers  # [G, 3] x, y, radius [m]
     recovery_points: Numbers  # [M, 2] [m]
-
-
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    """A figure and its canvas.
-
-    Raises:
-        MissingExtra: If matplotlib is not installed.
-    """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise look.MissingExtra from error
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-    return figure, FigureCanvasAgg(figure)
 
 
 def _region(view: TopView, margin: float = 2.5) -> tuple[float, float, float, float]:
@@ -141,7 +125,7 @@ def world(
     Raises:
         MissingExtra: If matplotlib is not installed.
     """
-    figure, _ = _figure(15.0, 10.0)
+    figure = look.page(15.0, 10.0)
     grid = figure.add_gridspec(2, 6, height_ratios=(1.7, 1.0), hspace=0.16, wspace=0.25)
     _draw_top(figure.add_subplot(grid[0, :3]), view)
     _draw_truth(figure, figure.add_subplot(grid[0, 3:]), view, truth)
@@ -158,7 +142,7 @@ def world(
     axes.set_aspect("equal")
     axes.set_title("LiDAR sweep (colour: height)", fontsize=9)
     axes.tick_params(labelsize=7)
-    return _save(figure, Path(file))
+    return look.save(figure, Path(file))
 
 
 def gallery(file: str | Path, rows: Sequence[Sequence[tuple[TopView, np.ndarray]]]) -> Path:
@@ -175,7 +159,7 @@ def gallery(file: str | Path, rows: Sequence[Sequence[tuple[TopView, np.ndarray]
     columns = max((len(row) for row in rows), default=0)
     if not columns:
         raise ValueError("there is no world to draw: rows is empty.")
-    figure, _ = _figure(4.6 * columns, 2.5 * len(rows))
+    figure = look.page(4.6 * columns, 2.5 * len(rows))
     grid = figure.add_gridspec(len(rows), 2 * columns, wspace=0.04, hspace=0.18)
     for i, row in enumerate(rows):
         for j, (view, image) in enumerate(row):
@@ -183,7 +167,7 @@ def gallery(file: str | Path, rows: Sequence[Sequence[tuple[TopView, np.ndarray]
             axes = figure.add_subplot(grid[i, 2 * j + 1])
             axes.imshow(np.clip(image, 0, 1), interpolation="nearest")
             axes.set_axis_off()
-    return _save(figure, Path(file))
+    return look.save(figure, Path(file))
 
 
 def samples(file: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
@@ -200,7 +184,7 @@ def samples(file: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """
     cameras, predicted = max(len(row["images"]) for row in rows), all("p_dead" in row for row in rows)
     columns = cameras + 3 + predicted
-    figure, _ = _figure(1.7 * columns, 1.95 * len(rows))
+    figure = look.page(1.7 * columns, 1.95 * len(rows))
     grid = figure.add_gridspec(len(rows), columns, wspace=0.04, hspace=0.22)
     for i, row in enumerate(rows):
         for k, image in enumerate(row["images"]):
@@ -214,7 +198,7 @@ def samples(file: str | Path, rows: Sequence[Mapping[str, Any]]) -> Path:
             axes.imshow(np.rot90(picture)[:, ::-1], interpolation="nearest")  # forward is up, left is left
             axes.set_title(name, fontsize=6)
             axes.set_axis_off()
-    return _save(figure, Path(file))
+    return look.save(figure, Path(file))
 
 
 def _grids(row: Mapping[str, Any], predicted: bool) -> list[tuple[str, np.ndarray]]:
@@ -233,9 +217,3 @@ def _grids(row: Mapping[str, Any], predicted: bool) -> list[tuple[str, np.ndarra
         said[np.asarray(row["local_map"]) == len(KNOWN) - 1] = KNOWN[-1]
         out.append((f"said: {marked(np.asarray(row['p_open']) >= 0.5)}, dead end {row['p_flag']:.2f}", said))
     return out
-
-
-def _save(figure: Any, file: Path) -> Path:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, bbox_inches="tight")
-    return file
