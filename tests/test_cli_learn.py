@@ -70,6 +70,7 @@ def test_a_short_training(capsys, tmp_path, monkeypatch):
     assert f"wrote {tmp_path / 'run' / 'weights.safetensors'}" in err
     trained = weights.load(tmp_path / "run" / "weights.safetensors", LEAST)
     assert trained.notes["figures"]["accuracy"] == pytest.approx(figures["accuracy"])
+    assert trained.notes["data"]["train"]["num_frames"] == 16 and trained.notes["data"]["validation"]["seed"] == 1
     assert "give --resume to go on with it" in said(capsys, *argv[1:])
     assert "begun with another seed" in said(capsys, *argv[1:-1], other(tmp_path, config | {"seed": 3}), "--resume")
     assert main([*map(str, argv), "--resume"]) == 0  # there is nothing left to do

@@ -1,6 +1,7 @@
 """`drnav train`: data sets in, weights out."""
 
 import sys
+from typing import Any
 
 from drnav_jax import dataset, report, train
 from drnav_jax.cli import process
@@ -17,6 +18,15 @@ def _validation(args: Train) -> list[Batch]:
     if not count:
         raise ValueError(f"{args.validation} holds {len(source)} frames: validation needs at least {CHUNK}.")
     return [batch_of(f._asdict()) for f in dataset.batches(args.validation, CHUNK, 0, epochs=1, workers=0)]
+
+
+def _about(args: Train) -> dict[str, dict[str, Any]]:
+    """What the sets are, for the notes beside the weights."""
+    sets = {"train": args.data, "validation": args.validation}
+    manifests = {name: dataset.read_manifest(folder) for name, folder in sets.items() if folder is not None}
+    return {
+        name: {key: m["spec"][key] for key in ("split", "seed", "num_frames", "families")} for name, m in manifests.items()
+    }
 
 
 def perform(args: Train) -> int:
@@ -44,7 +54,9 @@ def perform(args: Train) -> int:
     try:
         with stdout_kept(args.json):
             said = lambda step, figures: bar(step, note=_note(figures))  # noqa: E731
-            result = train.train(spec, source, validation, args.out, resume=args.resume, progress=said)
+            result = train.train(
+                spec, source, validation, args.out, resume=args.resume, progress=said, data=_about(args)
+            )
     except KeyboardInterrupt:
         print(f"drnav: interrupted; the same command with --resume goes on in {args.out}/", file=sys.stderr)
         return INTERRUPTED

@@ -87,6 +87,7 @@ def _begin(folder: Path, spec: TrainSpec, resume: bool) -> None:
 def train(
     spec: TrainSpec, source: Source, validation: Iterable[Batch], out: Path, *, resume: bool = False,
     devices: list[Any] | None = None, progress: Callable[[int, dict[str, float]], None] | None = None,
+    data: dict[str, Any] | None = None,
 ) -> Result:  # fmt: skip
     """Train until `spec.steps` are done.
 
@@ -98,6 +99,7 @@ def train(
         resume: Go on from the last checkpoint in `out`.
         devices: To share batches; None = all.
         progress: Called with the steps done and the latest figures.
+        data: What the frames are, in JSON values; kept with the weights.
 
     Raises:
         ValueError: If `out` holds another run, there is nothing to resume, or nothing to start from.
@@ -144,12 +146,18 @@ def train(
             params=best.average, calibration=temper, figures=validate.figures(found), step=int(best.step),
             samples_per_s=latest.get("samples_per_s", 0.0),
         )  # fmt: skip
-        weights.save(out / "weights.safetensors", spec.network, best.average, temper, {"figures": result.figures})
+        about = {"figures": result.figures, "step": result.step, "data": data or {}, "run": _plain(spec)}
+        weights.save(out / "weights.safetensors", spec.network, best.average, temper, about)
         return result
     finally:
         getattr(frames, "close", lambda: None)()  # the processes that read ahead
         kept.close()
         log.close()
+
+
+def _plain(spec: TrainSpec) -> dict[str, Any]:
+    """The settings of a run, without the network, which weights tell by themselves."""
+    return {name: value for name, value in settings.plain(spec).items() if name != "network"}
 
 
 def fitted(spec: TrainSpec, params: Any, validation: Iterable[Batch]) -> Calibration:

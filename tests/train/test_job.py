@@ -63,7 +63,7 @@ def logged(out):
 def whole(tmp_path_factory, validation):
     """(folder, result, progress) of a run that nobody interrupts."""
     out, said = tmp_path_factory.mktemp("whole") / "run", []
-    result = run(out, validation, progress=lambda step, figures: said.append((step, dict(figures))))
+    result = run(out, validation, progress=lambda step, figures: said.append((step, dict(figures))), data={"seed": 7})
     return out, result, said
 
 
@@ -75,6 +75,8 @@ def test_what_a_run_leaves_behind(whole, validation):
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.asarray, trained.params), best.average)
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(np.asarray, trained.params), result.params)
     assert trained.calibration == result.calibration and trained.notes["figures"].keys() == result.figures.keys()
+    assert trained.notes["data"] == {"seed": 7} and trained.notes["step"] == result.step
+    assert trained.notes["run"]["batch_size"] == 2 and "network" not in trained.notes["run"]
     lines = logged(out)
     assert [(line["step"], line["kind"]) for line in lines] == [
         (2, "validation"), (4, "validation"), (6, "train"), (6, "validation")
