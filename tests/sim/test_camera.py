@@ -116,13 +116,13 @@ MIXED = world_of(
 def test_depth_is_that_of_single_rays(mounts, veils):
     spec, pose = RigSpec(mounts, shape=(18, 23)), np.array([0.3, -0.2, 0.25], np.float32)
     ours, wrong, fell = depth(MIXED, spec, pose, veils=veils), 0, 0
-    for camera, (p, rays) in zip(ours, rays_of(spec, pose), strict=True):
+    for image, (p, rays) in zip(ours, rays_of(spec, pose), strict=True):
         for index in np.ndindex(spec.shape):
             expected, _ = trace(MIXED, p, rays[index], veils, NEAR)
             below = (p + expected * rays[index])[2] < -1e-3
             fell += below
             # An edge that passes through a pixel's middle may fall to either side.
-            wrong += abs(camera[index] - expected) > ROUNDING * (1 + expected) + below * MARCH
+            wrong += abs(image[index] - expected) > ROUNDING * (1 + expected) + below * MARCH
     assert fell > 5 and wrong <= 2
 
 
