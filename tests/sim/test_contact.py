@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax import sim
+from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax.worlds.world import HEADROOM, World, from_grid, make_world, rasterise, stack_worlds
 
 SAMPLES = 4000  # points per obstacle: about 1 mm apart

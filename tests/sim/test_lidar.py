@@ -8,9 +8,9 @@ import pytest
 from reference_rays import MARCH, trace
 from scipy import stats
 
+from drnav_jax import sim
 from drnav_jax.bench.lidar import lidar_against_mujoco, native_lidar
 from drnav_jax.bench.obstacles import random_obstacles
-from drnav_jax import sim
 from drnav_jax.sim.lidar import HIT_MARGIN
 from drnav_jax.worlds.materials import EXTINCTION, Material
 from drnav_jax.worlds.world import Scenery, World, from_grid, make_world, stack_worlds, surfaces
