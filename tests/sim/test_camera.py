@@ -10,7 +10,7 @@ import pytest
 from reference_rays import MARCH, trace
 
 from drnav_jax import sim
-from drnav_jax.bench import camera
+from drnav_jax.bench import camera as native_camera
 from drnav_jax.bench.obstacles import random_obstacles
 from drnav_jax.sim.camera import KNEE
 from drnav_jax.sim.sight import NEAR
@@ -57,7 +57,7 @@ def test_depth_is_that_of_mujocos_renderer(mounts, seed):
     spec, poses = RigSpec(mounts, shape=(72, 96)), np.array([[0.0, 0.0, 0.3], [0.2, -0.1, 2.0]], np.float32)
     world, ground = (random_obstacles(seed, n, extent=12.0) for n in (60, 0))
     try:
-        native = camera.native_views(spec, world, rig_of(spec), poses)
+        native = native_camera.native_views(spec, world, rig_of(spec), poses)
     except RuntimeError as error:
         pytest.skip(str(error))
     ours, bare = (np.concatenate([depth(w, spec, pose) for pose in poses]) for w in (world, ground))
@@ -73,10 +73,10 @@ def test_depth_is_that_of_mujocos_renderer(mounts, seed):
 
 
 def test_without_opengl_one_is_told_what_to_install(monkeypatch):
-    monkeypatch.setattr(camera, "GL", ("none-such",))
+    monkeypatch.setattr(native_camera, "GL", ("none-such",))
     world = random_obstacles(0, 2)
     with pytest.raises(RuntimeError, match="install libegl1 or libosmesa6 .none-such: .*none-such"):
-        camera.native_views(SMALL, world, rig_of(SMALL), np.zeros((1, 3), np.float32))
+        native_camera.native_views(SMALL, world, rig_of(SMALL), np.zeros((1, 3), np.float32))
 
 
 # One ray at a time, in float64. What the rays of all pixels are is `rays_of` below, from the mounts' own definition.

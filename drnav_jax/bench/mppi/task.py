@@ -96,9 +96,10 @@ def make(num_steps: int = 56, seed: int = 0, size: int = 256, resolution: float 
     centre = (np.arange(size) + 0.5) * resolution - 0.5 * size * resolution
     risk = np.exp(-(np.square(centre - 1.0)[:, None] + np.square(centre - 0.8)[None, :]))
     speeds = np.asarray([0.35, 0.2]) + rng.normal(0, 0.05, (num_steps, 2))
+    f32 = lambda a: np.asarray(a, np.float32)  # noqa: E731
     return Task(
-        pose=np.float32([0.012, -0.017, 0.3]), twist=np.float32([0.3, 0.1]), goal=np.float32([4.0, 2.5]),
-        cost=np.minimum(cost, 254.0), risk=(np.round(risk / RISK_STEP) * RISK_STEP).astype(np.float32),
+        pose=f32([0.012, -0.017, 0.3]), twist=f32([0.3, 0.1]), goal=f32([4.0, 2.5]),
+        cost=np.minimum(cost, 254.0), risk=f32(np.round(risk / RISK_STEP) * RISK_STEP),
         origin=np.full(2, -0.5 * size * resolution, np.float32), resolution=resolution,
-        control=speeds.astype(np.float32), sigma=np.float32([0.2, 0.4]), accelerations=np.float32([3.0, 3.5]),
+        control=speeds.astype(np.float32), sigma=f32([0.2, 0.4]), accelerations=f32([3.0, 3.5]),
     )  # fmt: skip
