@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from drnav_jax import metrics, navigator, worlds
@@ -16,6 +17,7 @@ from drnav_jax.models import fusion, geometric, oracle, silent, weights
 from drnav_jax.navigator import NavParams, NavSpec
 from drnav_jax.planning.compositions import planner
 from drnav_jax.planning.goal_generator import GeneratorSpec
+from drnav_jax.planning.tracker import Critics
 from drnav_jax.sim import CameraParams, episode, mjx
 from drnav_jax.sim.episode import EpisodeParams, EpisodeSpec
 from drnav_jax.sim.lidar import LidarParams
@@ -143,8 +145,13 @@ def spec_of(
 
 
 @functools.cache
-def policy_of(spec: NavSpec) -> episode.Policy:
-    """The navigator as the simulator wants it; it logs mode, g*, EDE, P_dead and recoveries of every tick."""
+def policy_of(spec: NavSpec, explained: bool = False) -> episode.Policy:
+    """The navigator as the simulator wants it; it logs mode, g*, EDE, P_dead and recoveries of every tick.
+
+    Args:
+        spec: The robot.
+        explained: Log what `explain` reads, too: the terms of the choices and of the ten best candidates.
+    """
 
     def init(params: NavParams, pose: jax.Array) -> navigator.NavState:
         return navigator.init(spec, params, pose)
@@ -155,6 +162,11 @@ def policy_of(spec: NavSpec) -> episode.Policy:
             "mode": info.mode, "local_goal": info.local_goal.xy, "exposure": info.local_goal.exposure,
             "p_dead": info.p_dead, "recoveries": info.recoveries, "certified": info.track.certified,
         }  # fmt: skip
+        if explained:
+            goal = info.local_goal
+            chosen, best = (jnp.stack(terms, axis=-1) for terms in (goal.terms, goal.best))
+            log["why_goal"] = Critics(chosen=chosen[0], best=best, best_cost=goal.best_score)
+            log["why_command"] = info.track.critics
         return state, command, log
 
     return episode.Policy(init=init, step=step)
@@ -284,6 +296,7 @@ def evaluate(
     params: NavParams | None = None,
     progress: Callable[[int], None] | None = None,
     spec: EpisodeSpec = EpisodeSpec(),  # noqa: B008 (immutable)
+    explained: bool = False,
 ) -> Evaluation:
     """Drive every trip once, in one batch.
 
@@ -293,6 +306,7 @@ def evaluate(
         params: Overrides the setup's navigator parameters.
         progress: Called with the number of finished episodes.
         spec: Sizes of the simulation; its physics is the setup's.
+        explained: Log which terms decided (`policy_of`).
 
     Raises:
         ValueError: If there is no trip.
@@ -303,7 +317,7 @@ def evaluate(
     begin = time.perf_counter()
     batch = episode_params(trips, setup, params)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
-    policy = policy_of(setup.nav)
+    policy = policy_of(setup.nav, explained)
     result = episode.run(equipped(spec, setup), policy, batch, keys, progress=progress)
     kept = [k for k in range(len(trips)) if result.finished[k]]
     if not kept:

@@ -27,7 +27,7 @@ from drnav_jax.models import geometric
 from drnav_jax.planning import costmap, dynamics, follower, goal_generator, memory, nav2_recovery, route, tracker
 from drnav_jax.planning import recovery as behaviour
 from drnav_jax.planning.compositions import Composition
-from drnav_jax.planning.follower import Explained, FollowerParams, FollowerSpec, FollowerState
+from drnav_jax.planning.follower import FollowerParams, FollowerSpec, FollowerState
 from drnav_jax.planning.goal_generator import GeneratorSpec, LocalGoal
 from drnav_jax.planning.memory import MemorySpec, MemoryState
 from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
@@ -124,15 +124,14 @@ class NavState(NamedTuple):
 class Info(NamedTuple):
     """What one looks at, per tick."""
 
-    local_goal: LocalGoal  # g*, its score, EDE, and the weighted terms of the score
-    track: Track  # the command's certificate
+    local_goal: LocalGoal  # g*, its score, EDE, and the weighted terms of the score, also of the ten best candidates
+    track: Track  # the command's certificate, and its cost critic by critic, also of the ten best
     mode: Array  # [] int32, `planning.recovery.MODES`
     arrived: Array  # [] bool
     recoveries: Array  # [] int32, how often recovery began
     p_dead: Array  # [] P_dead under the robot
     clearance: Array  # [] clearance as the map has it [m]
     fault: Array  # [] bool: pose not finite or leapt, or no valid scan
-    critics: Explained | None  # of DWB or MPPI
 
 
 @partial(jax.jit, static_argnames="spec")
@@ -312,7 +311,7 @@ def _act(
     squeeze = (time < state.squeeze_until) | (recover.mode == behaviour.RETREAT)
     margin = params.score.margin
     score = params.score._replace(margin=jnp.where(squeeze, jnp.minimum(params.route.squeeze_margin, margin), margin))
-    choice = goal_generator.given(seen.goal)
+    choice = goal_generator.given(spec.generator, seen.goal)
     if planner.generates or planner.recovery == "drnav":
         made = goal_generator.generate(
             spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
@@ -331,15 +330,15 @@ def _act(
             risky, choice.xy,
         )  # fmt: skip
     following: Any = state.follower
-    seek_room, critics = recover.mode == behaviour.CLEAR, None
+    seek_room = recover.mode == behaviour.CLEAR
     track = tracker.track(spec.tracker, params.tracker, robot, local, pose, twist, choice.xy, seek_room)
     if planner.follows:
         n, (top, left) = spec.filter.local_cells, belief.local_corner(spec.filter)
         risk = grids.repeat(state.risk[top : top + n, left : left + n], 2)
-        following, followed, critics = follower.act(
+        following, followed = follower.act(
             spec.follower, planner, params.follower, robot, following, local, risk, pose, twist, heading_for, spec.dt, key
         )
-        track = jax.tree.map(lambda a, b: jnp.where(seek_room, a, b), track, followed)
+        track = tracker.instead(seek_room, track, followed)
     held, mode, entries = state.belief, recover.mode, recover.entries
     if planner.recovery == "nav2":
         waiting = arrived | ~healthy
@@ -360,7 +359,6 @@ def _act(
         p_dead=dead_end.probability(geometry.sample_nearest(window._replace(values=held.dead_end), pose[:2])),
         clearance=geometry.sample_bilinear(local, pose[:2]),
         fault=~healthy | leap | ~jnp.any(seen.point_valid),
-        critics=critics,
     )
     state = state._replace(
         belief=held,

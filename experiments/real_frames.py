@@ -185,7 +185,8 @@ def picture(frame: bags.Recorded, said: Said, number: int, since: float) -> viz.
 def summary(rows: list[dict[str, Any]], spent: list[float]) -> dict[str, Any]:
     """Over all frames."""
     names = [name for name in rows[0] if name.startswith(("share", "free", "occupied"))]
-    mean = {name: float(np.nanmean([row[name] for row in rows])) for name in names}
+    known = {name: [row[name] for row in rows if math.isfinite(row[name])] for name in names}
+    mean = {name: float(np.mean(values)) if values else math.nan for name, values in known.items()}
     return mean | {
         "frames": len(rows), "dead_end_frames": sum(row["dead_end"] for row in rows),
         "open_frames": {way: sum(row["p_open"][way] >= 0.5 for row in rows) for way in WAYS},

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from drnav_jax import cli, evaluate, report
-from drnav_jax.cli import drive
+from drnav_jax.cli import drive, explain
 from drnav_jax.cli.terminal import Bar
 from drnav_jax.models import weights
 from drnav_jax.viz import MissingExtra
@@ -178,6 +178,60 @@ def test_run_prints_a_table_and_cleans_up_after_itself(capsys, monkeypatch):
     assert set(os.listdir(out)) == {"summary.json", "timing.json"}
     found = json.loads((out / "summary.json").read_text())
     assert len(found["episodes"]) == found["summary"]["episodes"] == 2
+
+
+@pytest.mark.parametrize(
+    ("planner", "parts", "term"),
+    [("grid", {"goal", "command"}, "progress"), ("dwa", {"command"}, "heading"), ("nav2-dwb", {"command"}, "PathDist")],
+)
+def test_explain_says_which_critic_decided(capsys, planner, parts, term):
+    flags = ("run", "--world", "u:0", "--episodes", "2", "--time-limit", "1", "--planner", planner, "--no-pictures")
+    code, text, _ = call(capsys, *flags, "--explain", "--out", "x")
+    assert code == 0
+    ticks = [json.loads(line) for line in Path("x/explain.jsonl").read_text().splitlines()]
+    assert [(t["episode"], t["time_s"]) for t in ticks] == [(e, round(0.1 * k, 3)) for e in (0, 1) for k in range(10)]
+    moving = 0
+    for tick in ticks:
+        assert tick["mode"] == "drive" and tick["certified"] and parts == {"goal", "command"} & set(tick)
+        for part in parts:
+            why = tick[part]
+            count = len(why["cost"])
+            assert 1 <= count <= 10 and all(len(values) == count for values in why["best"].values())
+            assert list(why["best"]) == list(why["chosen"]) and why["cost"] == sorted(why["cost"])
+            total = sum(why["chosen"].values())
+            assert total == pytest.approx(why["cost"][0], rel=1e-3, abs=1e-3)
+            for name in why["chosen"]:
+                assert why["chosen"][name] == why["best"][name][0]
+        moving += abs(tick["v"]) > 0.05 or abs(tick["omega"]) > 0.05
+    assert moving > 5 and any(tick["command"]["chosen"].get(term, 1.0) > 0 for tick in ticks)
+    assert term in text and "decided by" in text and ("where to: g*" in text) == ("goal" in parts)
+    assert max(map(len, text.splitlines())) <= 160
+    code, _, _ = call(capsys, *flags, "--out", "y", "--explain", "--json")
+    code, out, _ = call(capsys, *flags, "--out", "y", "--json")  # it is the same drive, and cleans up
+    assert code == 0 and out == Path("x/summary.json").read_text() and not Path("y/explain.jsonl").exists()
+
+
+def test_the_table_says_what_the_runners_up_pay_more():
+    def tick(time, mode, near, risk):
+        best = {"near": near, "risk": risk}
+        chosen = {name: values[0] if values else 0.0 for name, values in best.items()}
+        cost = [a + b for a, b in zip(near, risk, strict=True)]
+        return {"time_s": time, "mode": mode, "v": 0.5, "omega": 0.0, "g": [1.0, 2.0],
+                "command": {"chosen": chosen, "best": best, "cost": cost}}  # fmt: skip
+
+    ticks = [tick(0.1 * k, "drive", [1.0, 0.5, 0.9], [0.2, 2.0, 1.8]) for k in range(100)]
+    ticks[57] = tick(5.7, "clear", [1.0, 1.0], [0.2, 0.2])
+    ticks[58] = tick(5.8, "drive", [1.0], [0.2])
+    ticks[99] = tick(9.9, "drive", [], [])
+    assert explain.lead(ticks[0]["command"]) == pytest.approx({"near": -0.3, "risk": 1.7})
+    assert {0.0, 5.7, 5.8, 9.9} <= {round(t["time_s"], 1) for t in explain.moments(ticks)}
+    assert len(explain.moments(ticks)) <= explain.ROWS + 2 and explain.moments(ticks[:1]) == ticks[:1]
+    lines = explain.table(explain.Told([ticks], ["u:0"]), "dwa").splitlines()
+    assert "dwa in u:0" in lines[0] and lines[3] == "how: the command"
+    assert lines[4].split() == ["time", "mode", "v", "omega", "g*", "near", "risk", "decided", "by"]
+    assert lines[5].split() == ["0.0", "s", "drive", "0.50", "0.00", "(1.0,", "2.0)", "1.00", "0.20", "risk", "+1.7"]
+    assert [line for line in lines if "clear" in line and line.endswith("a tie")]
+    assert lines[-1].endswith("all blocked") and any(line.endswith("no other") for line in lines)
 
 
 def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 from drnav_jax import navigator
 from drnav_jax.filter import FilterSpec, RecoverySpec
 from drnav_jax.navigator import NavParams, NavSpec
-from drnav_jax.planning import PLANNERS, GeneratorSpec, TrackerSpec
+from drnav_jax.planning import PLANNERS, GeneratorSpec, TrackerSpec, follower
 from drnav_jax.planning import recovery as behaviour
 from drnav_jax.planning.dwb import DwbSpec
 from drnav_jax.planning.follower import FollowerSpec
@@ -324,7 +324,7 @@ def test_followers_of_a_route_drive_around_the_wall(planner):
         seen = look(pose, twist, seed=k)
         state, command, info = drive(spec, PARAMS, state, seen, jax.random.key(k), replan=k % 5 == 0)
         assert within_limits(command, np.asarray(twist))
-        assert float(jnp.sum(info.critics.best)) < np.inf
+        assert float(jnp.sum(info.track.critics.best)) < np.inf
         pose, twist = kinematic.step(ROBOT, pose, twist, command, spec.dt)
         path.append(np.asarray(pose))
         if bool(info.arrived):
@@ -360,6 +360,9 @@ def test_every_planner_fits_together(planner):
         )
         chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
         assert command.v.shape == command.omega.shape == () == info.mode.shape
+        names, why = follower.critics(spec.follower, spec.planner), info.track.critics
+        assert why.chosen.shape == (len(names),) and why.best.shape == (10, len(names))
+        assert info.local_goal.best_score.shape == info.local_goal.best.progress.shape == (10,)
     assert spec.generator.num_candidates == (34 if not spec.planner.controls else 55)
 
 

@@ -21,13 +21,20 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_the_script_arrives():
-    (script,) = blocks("python")
+def said(script: str) -> str:
+    """What a script prints, which must be short and run without a complaint."""
     assert len([line for line in script.splitlines() if line.strip()]) <= 15
     env = os.environ | {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache")}
     done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("arrived: True, after ")
+    return done.stdout
+
+
+def test_the_robot_arrives_and_the_planner_goes_around():
+    drives, plans = blocks("python")
+    assert said(drives).startswith("arrived: True, after ")
+    cost, x, y, exposure = map(float, re.findall(r"-?\d+\.?\d*(?:e-?\d+)?", said(plans).replace("x, y", "")))
+    assert abs(x - 5.0) < 0.3 and abs(y - 0.5) < 0.3 and cost < 0.9 and exposure < 0.2
 
 
 def test_the_commands_are_commands():

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 
 from drnav_jax import __version__, evaluate, report, sources
+from drnav_jax.cli import explain
 from drnav_jax.cli.flags import Compare, Run, Trial
 from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
 from drnav_jax.models import weights
@@ -88,13 +89,13 @@ def _command(args: Run | Compare) -> str:
     return "run" if isinstance(args, Run) else "compare"
 
 
-def drive(trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup]) -> Finished:
+def drive(trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], explained: bool = False) -> Finished:
     """Drive every planner; an interrupt keeps the episodes that are finished."""
     evaluations: dict[str, evaluate.Evaluation] = {}
     for name, setup in setups.items():
         bar = Bar(name, len(trips), "episodes")
         try:
-            evaluations[name] = evaluate.evaluate(trips, setup, progress=bar, spec=SPEC)
+            evaluations[name] = evaluate.evaluate(trips, setup, progress=bar, spec=SPEC, explained=explained)
         except KeyboardInterrupt:
             return Finished(evaluations, True)
         finally:
@@ -107,7 +108,7 @@ def drive(trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup]) -> Fini
 def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
     """The JSON object: nothing in it depends on when, or how fast, it was made."""
     flags = dataclasses.asdict(args)
-    config = {name: flags[name] for name in sorted(flags) if name not in ("out", "json", "no_pictures")}
+    config = {name: flags[name] for name in sorted(flags) if name not in ("out", "json", "no_pictures", "explain")}
     rule = "6 x the optimal time, at least 60 s"
     if args.time_limit is not None:
         rule = f"{args.time_limit:g} s, as asked for"
@@ -126,7 +127,9 @@ def result_of(args: Run | Compare, finished: Finished) -> dict[str, Any]:
     return head | {"planners": each, "ratios": report.ratios(times)}
 
 
-def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], finished: Finished) -> None:
+def draw(
+    out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup], finished: Finished, explained: bool
+) -> None:
     """Pictures of the first episodes with the belief of the first planner that has one, a film of the first episode."""
     believers = [name for name in finished.evaluations if planner(name).predicts]
     first = (believers or list(finished.evaluations))[0]
@@ -143,7 +146,7 @@ def draw(out: Path, trips: list[evaluate.Trip], setups: dict[str, evaluate.Setup
                 path = evaluate.path_driven(e.result, k, trip.scene.start)
                 drives[name] = report.Drive(path, e.records[e.kept.index(k)])
         one = jax.tree.map(lambda a, k=k: a[k], params)
-        states = episode.replay(evaluate.equipped(SPEC, setup), evaluate.policy_of(spec), one, keys[k])
+        states = episode.replay(evaluate.equipped(SPEC, setup), evaluate.policy_of(spec, explained), one, keys[k])
         path = drives[first].path
         every = math.ceil(len(path) / SPEC.chunk_ticks / MAX_FRAMES) if number == 1 else 0
         believed = report.believe(states, spec.filter, path, SPEC.dt, every)
@@ -170,12 +173,13 @@ def perform(args: Run | Compare) -> int:
     lack = lacking(args)
     if lack and any(setup.evidence == "geometric" for setup in setups.values()):
         print(f"drnav: {lack}: the geometric rule predicts dead ends instead of the network.", file=sys.stderr)
+    explained = isinstance(args, Run) and args.explain
     with stdout_kept(args.json):
-        finished = drive(trips, setups)
+        finished = drive(trips, setups, explained)
     if not finished.evaluations:
         print("drnav: interrupted before any episode was finished; nothing is written.", file=sys.stderr)
         return INTERRUPTED
-    for old in [out / "belief.gif", *out.glob("trajectory*.png")]:
+    for old in [out / "belief.gif", out / "explain.jsonl", *out.glob("trajectory*.png")]:
         old.unlink(missing_ok=True)
     result = result_of(args, finished)
     text = report.dumps(result)
@@ -185,12 +189,18 @@ def perform(args: Run | Compare) -> int:
     else:
         summaries = {name: e.summary for name, e in finished.evaluations.items()}
         print(report.table(summaries, result.get("ratios")), flush=True)
+    if explained:
+        ((name, setup),) = setups.items()
+        told = explain.told(finished.evaluations[name], setup.nav, SPEC.dt)
+        explain.write(out / "explain.jsonl", told)
+        if not args.json:
+            print(f"\n{explain.table(told, name)}", flush=True)
     walls = {name: {"episodes": len(e.records), "wall_s": e.wall_s} for name, e in finished.evaluations.items()}
     interrupted = finished.interrupted
     if not (args.no_pictures or interrupted):
         try:
             with stdout_kept(args.json):
-                draw(out, trips, setups, finished)
+                draw(out, trips, setups, finished, explained)
         except MissingExtra as error:
             print(f"drnav: no pictures: {error}", file=sys.stderr)
         except KeyboardInterrupt:

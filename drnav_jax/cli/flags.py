@@ -88,9 +88,15 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True)
 class Run(Trial):
-    """Drive one planner."""
+    """Drive one planner.
+
+    Attributes:
+        explain: Which critic decided? Print the costs behind the choices, term by term, and write those of every tick,
+            also of the ten best candidates, to explain.jsonl.
+    """
 
     planner: Annotated[str, tyro.conf.arg(metavar="NAME", help=f"One of {PLANNER_NAMES}.")] = "drnav"
+    explain: bool = False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Everything that decides where the robot goes, as functions of arrays; no model is known here."""
 
 from drnav_jax.planning import (
+    api,
     compositions,
     costmap,
     dwb,
@@ -17,6 +18,7 @@ from drnav_jax.planning import (
     scoring,
     tracker,
 )
+from drnav_jax.planning.api import Plan, PlanParams, PlanState, drive, plan
 from drnav_jax.planning.compositions import PLANNERS, Composition, planner
 from drnav_jax.planning.costmap import InflationParams, inflation
 from drnav_jax.planning.dwb import DwbSpec
@@ -49,14 +51,19 @@ __all__ = [
     "MppiSpec",
     "NoiseParams",
     "NoiseSpec",
+    "Plan",
+    "PlanParams",
+    "PlanState",
     "RecoveryParams",
     "RouteParams",
     "RouteSpec",
     "ScoreParams",
     "TrackerParams",
     "TrackerSpec",
+    "api",
     "compositions",
     "costmap",
+    "drive",
     "dwb",
     "dynamics",
     "exposure",
@@ -69,6 +76,7 @@ __all__ = [
     "mppi_critics",
     "nav2_recovery",
     "noise",
+    "plan",
     "planner",
     "recovery",
     "route",

@@ -76,6 +76,7 @@ class Info(NamedTuple):
     chosen: Array  # [7] scale times raw of the chosen
     best: Array  # [n, 7] of the best n legal trajectories, the best first
     best_index: Array  # [n] int32, which those are
+    best_cost: Array  # [n] their totals; inf where fewer are legal
     num_legal: Array  # [] int32
     illegal: Array  # [7] int32, trajectories that each critic calls illegal
 
@@ -215,6 +216,6 @@ def plan(
     state = dwb_critics.remember(params, state, pose, sent)
     return state, Command(v=sent[0], omega=sent[1]), Info(
         failed=failed, cost=-least[0], chosen=terms[:, index[0]], best=terms[:, index].T,
-        best_index=index.astype(jnp.int32), num_legal=jnp.sum(legal.astype(jnp.int32)),
+        best_index=index.astype(jnp.int32), best_cost=-least, num_legal=jnp.sum(legal.astype(jnp.int32)),
         illegal=jnp.sum((asked & ~judged.legal & used[None, :]).astype(jnp.int32), axis=1),
     )  # fmt: skip

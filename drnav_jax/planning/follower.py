@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from drnav_jax import geometry
-from drnav_jax.planning import costmap, dwb, dwb_critics, dynamics, mppi, mppi_critics, mppi_rollout, nav2_recovery
+from drnav_jax.planning import costmap, dwb, dwb_critics, dynamics, mppi, mppi_critics, mppi_rollout, nav2_recovery, tracker
 from drnav_jax.planning import path as paths
 from drnav_jax.planning.compositions import Composition
 from drnav_jax.planning.costmap import InflationParams
@@ -33,7 +33,7 @@ from drnav_jax.planning.nav2_recovery import Nav2Params, Nav2State
 from drnav_jax.planning.noise import NoiseSpec
 from drnav_jax.planning.path import Path
 from drnav_jax.planning.route import Route, RouteParams
-from drnav_jax.planning.tracker import Track
+from drnav_jax.planning.tracker import Critics, Track
 from drnav_jax.types import GridMap, RobotParams, Scalar
 
 # missions have no yaw at the goal: GoalAngle, and DWB's rotation in the goal window, have nothing to do
@@ -97,13 +97,6 @@ class FollowerState(NamedTuple):
     recovery: Nav2State | None
 
 
-class Explained(NamedTuple):
-    """Which critic decided."""
-
-    chosen: Array  # [C] weighted costs of the choice (MPPI: averaged over the samples as they were weighted)
-    best: Array  # [n, C] of the best candidates, the best first
-
-
 def mppi_critics_of(spec: FollowerSpec, planner: Composition) -> CriticSpec:
     """MPPI's critics: EDE joins them where the composition has it."""
     if not planner.exposure:
@@ -112,8 +105,9 @@ def mppi_critics_of(spec: FollowerSpec, planner: Composition) -> CriticSpec:
 
 
 def critics(spec: FollowerSpec, planner: Composition) -> tuple[str, ...]:
-    """Names of the critics in `Explained`."""
-    return mppi_critics_of(spec, planner).critics if planner.tracker == "mppi" else dwb_critics.CRITICS
+    """Names of what `Track.critics` holds, of whatever tracker."""
+    own = {"dwa": tracker.TERMS, "dwb": dwb_critics.CRITICS}
+    return mppi_critics_of(spec, planner).critics if planner.tracker == "mppi" else own[planner.tracker]
 
 
 @partial(jax.jit, static_argnames=("spec", "planner"))
@@ -187,7 +181,7 @@ def act(
     goal: Float[Array, "2"],
     dt: float,
     key: PRNGKeyArray,
-) -> tuple[FollowerState, Track, Explained]:
+) -> tuple[FollowerState, Track]:
     """One command along the path.
 
     Args:
@@ -228,8 +222,8 @@ def act(
         state = state._replace(dwb=held)
     command = dynamics.limit(wanted.v, wanted.omega, twist, robot, dt)
     near = geometry.sample_bilinear(clear, pose[:2])
-    track = Track(command=command, certified=~info.failed, cost=info.cost, clearance=near)
-    return state, track, Explained(chosen=info.chosen, best=info.best)
+    why = Critics(chosen=info.chosen, best=info.best, best_cost=info.best_cost)
+    return state, Track(command=command, certified=~info.failed, cost=info.cost, clearance=near, critics=why)
 
 
 def recover(

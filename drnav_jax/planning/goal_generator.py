@@ -30,6 +30,7 @@ class GeneratorSpec:
         num_headings: Straight headings (two of them point to the last g* and to the goal).
         dt: Step of the rollout [s].
         num_steps: Steps rolled out; `ScoreParams.horizon` may use fewer.
+        num_explained: Best candidates whose terms are in Info; all, if there are fewer.
     """
 
     num_speeds: int = 16
@@ -37,6 +38,7 @@ class GeneratorSpec:
     num_headings: int = 256
     dt: float = 0.1
     num_steps: int = 40
+    num_explained: int = 10
 
     def __post_init__(self) -> None:
         """Check counts."""
@@ -45,8 +47,11 @@ class GeneratorSpec:
                 "num_speeds and num_turns must be >= 0 and num_headings >= 3, "
                 f"got {self.num_speeds}, {self.num_turns}, {self.num_headings}."
             )
-        if self.dt <= 0 or self.num_steps < 1:
-            raise ValueError(f"dt must be > 0 s and num_steps >= 1, got {self.dt} and {self.num_steps}.")
+        if self.dt <= 0 or self.num_steps < 1 or self.num_explained < 1:
+            raise ValueError(
+                "dt must be > 0 s, num_steps and num_explained >= 1, "
+                f"got {self.dt}, {self.num_steps} and {self.num_explained}."
+            )
 
     @property
     def num_candidates(self) -> int:
@@ -64,6 +69,8 @@ class LocalGoal(NamedTuple):
     geometric: Float[Array, ""]  # J_geom of the chosen path
     terms: Terms  # weighted terms of the chosen score, [1] each
     index: Array  # [] int32, which candidate
+    best: Terms  # of the best candidates, [n] each, the best (which is the chosen) first
+    best_score: Float[Array, " n"]  # `BLOCKED` where fewer are free
 
 
 def candidates(
@@ -110,12 +117,13 @@ def candidates(
     )
 
 
-def given(xy: Float[Array, "2"]) -> LocalGoal:
+def given(spec: GeneratorSpec, xy: Float[Array, "2"]) -> LocalGoal:
     """A local goal that nobody generated: planners without a generator track the mission's goal itself."""
-    zero = jnp.zeros((), jnp.float32)
+    zero, none = jnp.zeros((), jnp.float32), jnp.zeros(min(spec.num_explained, spec.num_candidates), jnp.float32)
     return LocalGoal(
         xy=xy, valid=jnp.asarray(True), score=zero, exposure=zero, geometric=zero,
         terms=Terms(*[zero[None]] * len(Terms._fields)), index=jnp.asarray(-1, jnp.int32),
+        best=Terms(*[none] * len(Terms._fields)), best_score=none + BLOCKED,
     )  # fmt: skip
 
 
@@ -146,13 +154,14 @@ def generate(
     """
     chosen_from = candidates(spec, params, robot, pose, twist, goal, last, hysteresis)
     scores = scoring.score(field, chosen_from, params, robot, dt=spec.dt, num_steps=spec.num_steps)
-    index = jnp.argmin(scores.score).astype(jnp.int32)
+    # of equals the first comes first; what is looked at of one costs as much as of ten
+    _, order = jax.lax.top_k(-scores.score, min(spec.num_explained, spec.num_candidates))
     best, terms = scoring.explain(
-        field, scoring.at(chosen_from, index), params, robot, dt=spec.dt, num_steps=spec.num_steps
+        field, scoring.at(chosen_from, order), params, robot, dt=spec.dt, num_steps=spec.num_steps
     )
     valid = best.score[0] < BLOCKED
     return LocalGoal(
         xy=jnp.where(valid, jnp.stack([best.x[0], best.y[0]]), pose[:2]),
         valid=valid, score=best.score[0], exposure=best.exposure[0], geometric=best.geometric[0],
-        terms=terms, index=index,
+        terms=jax.tree.map(lambda a: a[:1], terms), index=order[0].astype(jnp.int32), best=terms, best_score=best.score,
     )  # fmt: skip

@@ -105,6 +105,7 @@ class Info(NamedTuple):
     chosen: Array  # [C] terms of the cost, averaged over the samples as the update weights them
     best: Array  # [n, C] terms of the n best samples, the best first
     best_index: Array  # [n] int32, which samples those are
+    best_cost: Array  # [n] their J: the terms, and the control cost of (1)
     effective: Array  # [] effective sample size
     temperature: Array  # [] as used
 
@@ -172,11 +173,11 @@ def update(
         temperature = mppi_weights.temperature_for(total, params.effective_share)
     weight = mppi_weights.softmin(total, temperature)
     control = control + sigma[None, :] * (deviation @ weight)
-    _, index = jax.lax.top_k(-total, spec.num_explained)
+    least, index = jax.lax.top_k(-total, spec.num_explained)
     return control, Info(
         failed=jnp.all(priced.collides), cost=jnp.min(total), chosen=priced.terms @ weight,
-        best=priced.terms[:, index].T, best_index=index.astype(jnp.int32), effective=mppi_weights.effective_size(weight),
-        temperature=temperature,
+        best=priced.terms[:, index].T, best_index=index.astype(jnp.int32), best_cost=-least,
+        effective=mppi_weights.effective_size(weight), temperature=temperature,
     )  # fmt: skip
 
 
@@ -226,7 +227,8 @@ def plan(
     begin = (jnp.zeros((), jnp.int32), state.control, state.history)
     shapes = jax.eval_shape(lambda: attempt((*begin, None)))[3]
     blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
-    again = lambda c: (c[0] == 0) | (c[3].failed & (c[0] <= params.retries))  # noqa: E731
+    retries = jnp.asarray(params.retries, jnp.int32)  # also where all parameters were made floats
+    again = lambda c: (c[0] == 0) | (c[3].failed & (c[0] <= retries))  # noqa: E731
     _, control, history, info = jax.lax.while_loop(again, attempt, (*begin, blank))
     if spec.smooth:
         control = savitzky_golay.smooth(control, history)

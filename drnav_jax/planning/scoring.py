@@ -325,8 +325,9 @@ def _block(reader: Reader, field: Any, candidates: Candidates, params: ScorePara
 
 
 def at(values: _Each, index: Array) -> _Each:
-    """Candidate `index` of any of the tuples here, as arrays of length 1."""
-    return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, index, 1), values)
+    """Candidates `index` `[n]` (or one, `[]`) of any of the tuples here, as arrays of length n (or 1)."""
+    index = jnp.atleast_1d(index)
+    return jax.tree.map(lambda a: a.at[index].get(mode="promise_in_bounds"), values)
 
 
 def path_of(candidate: Candidates, robot: RobotParams, *, dt: float, num_steps: int) -> Float[Array, "T 2"]:

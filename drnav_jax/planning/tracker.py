@@ -29,6 +29,7 @@ from drnav_jax.planning.dynamics import Motion
 from drnav_jax.types import Command, GridMap, RobotParams, Scalar
 
 DIP = 0.004  # [m]
+TERMS = ("distance", "clearance", "heading", "room", "smoothness")  # of J, as `Critics` lists them
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +43,7 @@ class TrackerSpec:
         num_steps: Steps of each half of the ranking rollout, each `dt`; twice that when slow.
         brake_ticks: Ticks within which every certified motion must have stopped.
         samples: Footprint checks per tick of the certificate.
+        num_explained: Best commands whose terms are in Info; all, if there are fewer.
     """
 
     num_speeds: int = 9
@@ -50,10 +52,12 @@ class TrackerSpec:
     num_steps: int = 6
     brake_ticks: int = 10
     samples: int = 2
+    num_explained: int = 10
 
     def __post_init__(self) -> None:
         """Check counts."""
-        if min(self.num_speeds, self.num_turns, self.num_steps, self.brake_ticks, self.samples) < 1 or self.dt <= 0:
+        counts = (self.num_speeds, self.num_turns, self.num_steps, self.brake_ticks, self.samples, self.num_explained)
+        if min(counts) < 1 or self.dt <= 0:
             raise ValueError(f"all counts must be >= 1 and dt > 0 s, got {self}.")
 
 
@@ -69,6 +73,14 @@ class TrackerParams(NamedTuple):
     slow: Scalar = 0.3  # [] share of v_max below which the robot is slow
 
 
+class Critics(NamedTuple):
+    """Which critic decided: what a command's cost is the sum of (here `TERMS`; or DWB's or MPPI's critics)."""
+
+    chosen: Array  # [C] of the choice (MPPI: averaged over the samples as they were weighted)
+    best: Array  # [n, C] of the best candidates, the best first
+    best_cost: Array  # [n] their costs; inf where fewer are admissible
+
+
 class Track(NamedTuple):
     """The chosen command and what it rests on."""
 
@@ -76,6 +88,13 @@ class Track(NamedTuple):
     certified: Bool[Array, ""]  # False: nothing could be certified, the command brakes
     cost: Float[Array, ""]  # J of the choice [s]
     clearance: Float[Array, ""]  # least clearance of the certified motion [m]
+    critics: Critics
+
+
+def instead(acts: Bool[Array, ""], other: Track, track: Track) -> Track:
+    """The other's command where it `acts`; the critics stay those of `track`."""
+    merge = lambda a, b: jax.tree.map(lambda x, y: jnp.where(acts, x, y), a, b)  # noqa: E731
+    return Track(*[merge(a, b) for a, b in zip(other[:-1], track[:-1], strict=True)], critics=track.critics)
 
 
 def _grid(num: int, low: Array, high: Array) -> Array:
@@ -173,18 +192,25 @@ def track(
     dx, dy = target[0] - last.x, target[1] - last.y
     distance = jnp.hypot(dx, dy)
     bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))
-    cost = (
-        (distance + params.clearance * lack) / robot.v_max
-        + params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0)
-        + params.room * jnp.maximum(limit - room(last), 0.0)
-        + params.smoothness * jnp.tile(jnp.abs(w - w0), 3) / robot.w_max
-    )
-    cost = jnp.where(seek_room, -room(last), cost)
-    cost = jnp.min(cost.reshape(3, -1), axis=0)
+    near = room(last)
+    terms = jnp.stack([
+        distance / robot.v_max,
+        params.clearance * lack / robot.v_max,
+        params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0),
+        params.room * jnp.maximum(limit - near, 0.0),
+        params.smoothness * jnp.tile(jnp.abs(w - w0), 3) / robot.w_max,
+    ])  # fmt: skip
+    only_room = jnp.asarray([name == "room" for name in TERMS])[:, None]
+    terms = jnp.where(seek_room, jnp.where(only_room, -near[None], 0.0), terms)
+    cost = jnp.sum(terms, axis=0).reshape(3, -1)
+    way, cost = jnp.argmin(cost, axis=0), jnp.min(cost, axis=0)
     cost = jnp.where(certified, cost, jnp.inf)
-    k = jnp.argmin(cost)
+    count = v.shape[0]
+    least_cost, order = jax.lax.top_k(-cost, min(spec.num_explained, count))  # of equals the first comes first
+    k, best = order[0], terms[:, way[order] * count + order].T
     any_certified = jnp.any(certified)
     command = dynamics.limit(
         jnp.where(any_certified, v[k], 0.0), jnp.where(any_certified, w[k], 0.0), twist, robot, dt
     )
-    return Track(command=command, certified=any_certified, cost=cost[k], clearance=least[k])
+    critics = Critics(chosen=best[0], best=best, best_cost=-least_cost)
+    return Track(command=command, certified=any_certified, cost=cost[k], clearance=least[k], critics=critics)

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from scipy import integrate, ndimage
 
+from drnav_jax import geometry
 from drnav_jax.planning import exposure
 from drnav_jax.planning.exposure import STANDING_SPEED, exposure_integral, exposure_sum
 from drnav_jax.types import GridMap
@@ -139,10 +140,118 @@ def test_gradients_are_the_differences(f, kinks):
     assert bool(jnp.all(weights >= 0)) and float(weights.sum()) > 1.0
 
 
-def test_gradients_stay_finite_where_the_path_stands_still():
-    still = f32(np.tile([1.0, 0.2], (5, 1)))
-    slope = jax.grad(lambda p: exposure_integral(field(HILL), p, 0.3, dt=0.1))(still)
-    assert bool(jnp.all(jnp.isfinite(slope)))
+def bilinear(values, x, y):
+    """Interpolation between centres in float64; outside the cells nothing."""
+    h, w = values.shape
+    gx, gy = (x - ORIGIN[0]) / RES64, (y - ORIGIN[1]) / RES64
+    if not (0 <= gx < w and 0 <= gy < h):
+        return 0.0
+    gx, gy = min(max(gx - 0.5, 0), w - 1), min(max(gy - 0.5, 0), h - 1)
+    j, i = min(int(gx), w - 2), min(int(gy), h - 2)
+    a, b = gx - j, gy - i
+    return float(np.array([1 - b, b]) @ values[i : i + 2, j : j + 2] @ np.array([1 - a, a]))
+
+
+def arcs(path):
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(path, axis=0).T)))
+
+
+def reference_integral(values, path, decay, dt):
+    """Simpson's rule on four panels per segment, in loops and float64."""
+    total, s = 0.0, arcs(path)
+    for a, b, s0, s1 in zip(path[:-1], path[1:], s[:-1], s[1:], strict=True):
+        density = [math.exp(-decay * (s0 + f * (s1 - s0))) * bilinear(values, *(a + f * (b - a)))
+                   for f in np.linspace(0, 1, 9)]  # fmt: skip
+        panels = sum(density[k] + 4 * density[k + 1] + density[k + 2] for k in range(0, 8, 2)) / 24
+        total += max(s1 - s0, STANDING_SPEED * dt) * panels
+    return total
+
+
+def reference_sum(values, path, decay, dt):
+    del dt
+    return sum(math.exp(-decay * s) * bilinear(values, *p) for s, p in zip(arcs(path), path, strict=True))
+
+
+def sampled_sum(risk, path, decay, dt):
+    """The chain map -> risk at the path's points -> the paper's sum."""
+    del dt
+    return exposure_sum(geometry.sample_bilinear(risk, path, fill=0.0), exposure.arc_lengths(path), decay)
+
+
+def integral(risk, path, decay, dt):
+    return exposure_integral(risk, path, decay, dt=dt)
+
+
+CHAINS = [(integral, reference_integral), (sampled_sum, reference_sum)]
+RES64 = float(np.float32(RESOLUTION))
+# float32 against float64: positions are rounded to 1e-7 of cells of 5 cm, which moves weights by 1e-5
+SLOPE = {"rel": 2e-3, "abs": 2e-4}
+
+
+@pytest.mark.parametrize(("ours", "theirs"), CHAINS)
+@pytest.mark.parametrize("crawl", [False, True])
+def test_every_slope_is_the_difference_in_double_precision(ours, theirs, crawl):
+    """Of every point of the path, of the decay, and of cells: on a rough map, also where the robot crawls or leaves it."""
+    rng = np.random.default_rng(3)
+    values = rng.random(SHAPE).astype(np.float32)
+    path = arc(2.0, 1.0, 8) + rng.normal(0, 0.02, (8, 2))
+    path[-1] = [5.03, 0.4]  # beyond the edge
+    if crawl:
+        path = path[0] + 2e-3 * (path - path[0])  # below the standing speed
+    path, decay, dt = path.astype(np.float32).astype(float), 0.4, 0.1
+    values64, eps = values.astype(float), 1e-7
+    risk = GridMap(f32(values), f32(ORIGIN), RESOLUTION)
+    value, slopes = jax.value_and_grad(
+        lambda v, p, d: ours(risk._replace(values=v), p, d, dt), argnums=(0, 1, 2)
+    )(f32(values), f32(path), f32(decay))
+    assert float(value) == pytest.approx(theirs(values64, path, decay, dt), rel=1e-4)
+    for t, axis in np.ndindex(path.shape):
+        bump = np.zeros_like(path)
+        bump[t, axis] = eps
+        want = (theirs(values64, path + bump, decay, dt) - theirs(values64, path - bump, decay, dt)) / (2 * eps)
+        assert float(slopes[1][t, axis]) == pytest.approx(want, **SLOPE), (t, axis)
+    want = (theirs(values64, path, decay + 1e-4, dt) - theirs(values64, path, decay - 1e-4, dt)) / 2e-4
+    assert float(slopes[2]) == pytest.approx(want, **SLOPE)
+    touched = np.argwhere(np.asarray(slopes[0]) != 0)
+    assert len(touched) >= 4
+    for i, j in [*touched[:: max(len(touched) // 12, 1)], (0, 0)]:
+        bump = np.zeros_like(values64)
+        bump[i, j] = 1.0  # linear in the map: no error of the difference
+        want = theirs(values64 + bump, path, decay, dt) - theirs(values64, path, decay, dt)
+        assert float(slopes[0][i, j]) == pytest.approx(want, **SLOPE), (i, j)
+
+
+@pytest.mark.parametrize("ours", [integral, sampled_sum])
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_slopes_are_numbers_where_points_coincide(ours, dt):
+    """At rest, resting between two moves, on a corner of the map, and outside: no 0 / 0 out of the root."""
+    risk = field(HILL)
+    rest = np.tile([1.0, 0.2], (5, 1))
+    paused = np.array([[0.0, 0.0], [0.5, 0.1], [0.5, 0.1], [0.5, 0.1], [1.0, 0.0]])
+    corner, outside = np.tile(ORIGIN, (4, 1)), np.tile([99.0, 99.0], (4, 1))
+    for path in (rest, paused, corner, outside):
+        slopes = jax.grad(lambda v, p: ours(risk._replace(values=v), p, 0.3, dt), argnums=(0, 1))(risk.values, f32(path))
+        assert all(bool(jnp.all(jnp.isfinite(s))) for s in slopes)
+    # the pause costs time on the spot, and where it is spent matters
+    pull = jax.grad(lambda p: ours(risk, p, 0.3, dt))(f32(paused))
+    assert float(jnp.abs(pull[1:4]).sum()) > 1e-3
+
+
+def test_descent_leads_a_path_out_of_the_risk():
+    """What the slope is for: a path across a hill of risk, its ends held, is bent around it."""
+    risk, path = field(lambda x, y: 0.9 * np.exp(-((x - 1.3) ** 2 + (y - 0.0) ** 2) / 0.18)), None
+    begin = f32(np.stack([np.linspace(0.0, 2.6, 14), 0.02 * np.sin(np.linspace(0, np.pi, 14))], 1))
+
+    def objective(middle):
+        whole = jnp.concatenate([begin[:1], middle, begin[-1:]])
+        bends = whole[2:] - 2.0 * whole[1:-1] + whole[:-2]
+        return 3.0 * exposure_integral(risk, whole, 0.0) + exposure.arc_lengths(whole)[-1] + 5.0 * jnp.sum(bends * bends)
+
+    step, path = jax.jit(jax.grad(objective)), begin[1:-1]
+    for _ in range(800):
+        path = path - 0.006 * step(path)
+    assert float(objective(path)) < 0.75 * float(objective(begin[1:-1]))
+    assert float(jnp.abs(path[:, 1]).max()) > 0.3
 
 
 def test_arc_lengths():

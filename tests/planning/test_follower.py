@@ -129,7 +129,8 @@ def test_they_drive_around_the_wall_within_the_limits(wall, way, name):
     for k in range(110):
         if k % 10 == 0:
             state = replan(name, state, way, xy=pose[:2], time=k * DT)
-        state, track, why = step(state, f32(pose), f32(twist), jax.random.key(k))
+        state, track = step(state, f32(pose), f32(twist), jax.random.key(k))
+        why = track.critics
         command = np.array([track.command.v, track.command.omega], float)
         tiny = 1e-5
         assert np.isfinite(command).all()
@@ -162,7 +163,7 @@ def test_whatever_they_are_told_the_command_is_sane(wall, name):
         pose = f32([*rng.uniform(-4, 9, 2), rng.uniform(-3, 3)])
         twist = rng.uniform((-0.2, -1.5), (1.0, 1.5))
         found = replan(name, state, None, xy=rng.uniform(-4, 9, 2), time=2.0 * k) if planner.path == "straight" else state
-        state, track, _ = step(found, pose, f32(twist), jax.random.key(k))
+        state, track = step(found, pose, f32(twist), jax.random.key(k))
         v, w = float(track.command.v), float(track.command.omega)
         assert np.isfinite([v, w]).all() and -0.2 - 1e-6 <= v <= 1.0 + 1e-6 and abs(w) <= 1.5 + 1e-6
         assert abs(v - twist[0]) <= ROBOT.a_max * DT + 1e-5 and abs(w - twist[1]) <= ROBOT.alpha_max * DT + 1e-5
@@ -180,7 +181,7 @@ def test_recovery_takes_over_and_starts_the_controller_anew(wall, way):
     state = state._replace(mppi=state.mppi._replace(control=jnp.ones_like(state.mppi.control)))
     pose, twist = f32([0, 0, 0]), f32([0, 0])
     step = acting("nav2-mppi", state, wall[1], None, None, None)
-    _, track, _ = step(state, pose, twist, jax.random.key(0))
+    _, track = step(state, pose, twist, jax.random.key(0))
     args = wall[1], track, pose, twist, f32(1.0), jnp.asarray(False), DT
     quiet, same, wipe = follower.recover(PARAMS, ROBOT, state, *args)
     assert float(same.command.v) == float(track.command.v) and not bool(wipe)

@@ -1,5 +1,7 @@
 """The goal generator: which candidates there are, and that g* is the best of them."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -95,6 +97,18 @@ def test_the_choice_is_the_least_score():
     assert float(sum(got.terms)[0]) == pytest.approx(float(got.score), abs=1e-4)
 
 
+def test_the_best_are_the_least_scores_and_their_terms_add_up():
+    rng = np.random.default_rng(1)
+    words = field(rng.random(SHAPE) < 0.004)
+    _, scores = everything(words)
+    got, want = choose(words), np.sort(np.asarray(scores.score))[: SPEC.num_explained]
+    np.testing.assert_allclose(got.best_score, want, atol=1e-5)
+    np.testing.assert_allclose(sum(got.best), want, atol=1e-4)
+    chex.assert_trees_all_equal(jax.tree.map(lambda a: a[:1], got.best), got.terms)
+    few = dataclasses.replace(SPEC, num_speeds=0, num_headings=6)
+    assert choose(words, spec=few).best_score.shape == (6,)
+
+
 def test_in_the_open_it_heads_for_the_goal():
     got = choose(field())
     assert abs(float(got.xy[1])) < NEW and PARAMS.range_min - NEW <= float(got.xy[0]) <= PARAMS.range_max + NEW
@@ -156,7 +170,7 @@ def test_when_all_is_blocked_it_says_so_and_stays():
 
 
 def test_what_nobody_generated_is_the_goal_itself():
-    got = goal_generator.given(f32([3.0, -1.0]))
+    got = goal_generator.given(SPEC, f32([3.0, -1.0]))
     chex.assert_trees_all_equal_shapes_and_dtypes(got, choose(field()))
     np.testing.assert_array_equal(got.xy, [3, -1])
     assert bool(got.valid) and int(got.index) == -1

@@ -103,6 +103,34 @@ def test_what_is_certified_can_stop(clutter):
     assert (np.asarray(got.clearance) >= allowed)[certified & moving].all()
 
 
+def test_the_terms_add_up_and_the_best_come_first(clutter):
+    pose, twist, target = random_states(4, clutter)
+    got = track_all(SPEC, PARAMS, ROBOT, clutter, pose, twist, target, jnp.zeros(STATES, bool))
+    why = jax.tree.map(np.asarray, got.critics)
+    sure = np.isfinite(why.best_cost)
+    assert why.best.shape == (STATES, SPEC.num_explained, len(tracker.TERMS)) and 0.5 < sure.mean() < 1.0
+    np.testing.assert_allclose(why.best.sum(axis=-1)[sure], why.best_cost[sure], rtol=1e-5, atol=1e-5)
+    assert (np.diff(np.where(sure, why.best_cost, 1e9), axis=1) >= 0).all()
+    np.testing.assert_array_equal(why.chosen, why.best[:, 0])
+    some = np.isfinite(np.asarray(got.cost))
+    np.testing.assert_array_equal(why.best_cost[some, 0], np.asarray(got.cost)[some])
+    # how far it is to the target from where the motion ends, and how much clearance counts, is known elsewhere
+    wide = go(clutter, pose[0], twist[0], target[0], params=PARAMS._replace(clearance=0.0, room=0.0, smoothness=0.0))
+    named = dict(zip(tracker.TERMS, np.asarray(wide.critics.chosen), strict=True))
+    assert named["clearance"] == named["room"] == named["smoothness"] == 0.0 < named["distance"]
+    least = np.hypot(*(target[0] - pose[0, :2])) - ROBOT.v_max * 4 * SPEC.num_steps * DT
+    assert named["distance"] * ROBOT.v_max >= max(least, 0.0)
+
+
+def test_seeking_room_the_terms_are_the_room(clutter):
+    pose, twist, target = random_states(5, clutter)
+    got = track_all(SPEC, PARAMS, ROBOT, clutter, pose, twist, target, jnp.ones(STATES, bool))
+    chosen, room = np.asarray(got.critics.chosen), tracker.TERMS.index("room")
+    assert (np.delete(chosen, room, axis=1) == 0).all()
+    some = np.isfinite(np.asarray(got.cost))
+    np.testing.assert_array_equal(chosen[some, room], np.asarray(got.cost)[some])
+
+
 def test_commands_are_within_the_limits(clutter):
     pose, twist, target = random_states(2, clutter)
     got = track_all(SPEC, PARAMS, ROBOT, clutter, pose, twist, target, jnp.zeros(STATES, bool))
