@@ -93,7 +93,9 @@ def messages(bag: Bag, topics: Collection[str]) -> Iterator[Message]:
         ValueError: If the bag is broken further on.
     """
     wanted = [c for c in bag.reader.connections if c.topic in topics]
-    stream = bag.reader.messages(connections=wanted) if wanted else iter(())
+    if not wanted:
+        return
+    stream = bag.reader.messages(connections=wanted)
     while True:
         try:
             connection, recorded, raw = next(stream)
