@@ -12,7 +12,7 @@ cell's answer weighs:
 What it says of traversability corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with no
 return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass,
 
-    (4)  blocked(c) = `weight` m logit(1 - t(c)) within `sight` of the robot, kept within +-`most`; 0 elsewhere
+    (4)  blocked(c) = `weight` m logit(1 - t(c)) within `sight` of the robot, kept within -`opens`..`closes`; 0 elsewhere
 """
 
 import functools
@@ -46,7 +46,8 @@ class FusionParams(NamedTuple):
     still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
     sight: Scalar = 5.0  # [] eq. 4 [m]
-    most: Scalar = 2.0  # [] eq. 4 [nat]
+    closes: Scalar = 2.0  # [] eq. 4 [nat]
+    opens: Scalar = 2.0  # [] eq. 4 [nat]
     rule: GeometricParams = GeometricParams()  # an input of the network, and the answer where there is no camera
 
 
@@ -110,7 +111,7 @@ def blocked(
     asked = returned | ((known == FREE) & ~_grown(returned, 1))
     x, y = geometry.cell_centres(spec.bev.shape, jnp.asarray(spec.bev.origin, jnp.float32), spec.bev.resolution)
     asked &= (x * x + y * y <= jnp.square(params.sight)) & jnp.isfinite(traversable)
-    said = jnp.clip(-traversable, -params.most, params.most)
+    said = jnp.clip(-traversable, -params.opens, params.closes)
     return jnp.where(asked & jnp.any(observation.image_valid), params.weight * _moves(params, observation) * said, 0.0)
 
 
