@@ -64,7 +64,7 @@ def growth(file: str | Path, curves: Mapping[str, Curve], title: str = "") -> Pa
         axes.xaxis.set_minor_locator(NullLocator())
         for side, label, colour in ((axes, "time [ms]", TIME), (beside, "memory [MB]", MEMORY)):
             side.set_ylabel(label, fontsize=8.5, color=colour)
-            side.tick_params(labelsize=7.5)
+            side.tick_params(which="both", labelsize=7.5)
     for axes in panels[len(curves) :]:
         axes.set_visible(False)
     if title:

@@ -49,10 +49,11 @@ class Prepared(NamedTuple):
 def prepare(task: Task) -> Prepared:
     """Put the task where JAX finds it."""
     f32 = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
-    a, alpha = task.accelerations
+    a, alpha = map(float, task.accelerations)
+    std_v, std_w = map(float, task.sigma)
     words = mppi_critics.pack(f32(task.cost), f32(task.risk))
     params = MppiParams(
-        temperature=task.temperature, gamma=task.temperature, std_v=task.sigma[0], std_w=task.sigma[1]
+        temperature=task.temperature, gamma=task.temperature, std_v=std_v, std_w=std_w
     )
     ready = Prepared(
         params=params, limits=Limits(v_min=-jnp.inf, v_max=jnp.inf, w_max=jnp.inf, a_max=a, a_min=-a, alpha_max=alpha),
@@ -62,8 +63,7 @@ def prepare(task: Task) -> Prepared:
         ),
         pose=f32(task.pose), twist=f32(task.twist), control=f32(task.control),
     )  # fmt: skip
-    numbers = lambda tree: jax.tree.map(lambda a: jnp.asarray(a, jnp.float32), tree)  # noqa: E731
-    return ready._replace(params=numbers(ready.params), limits=numbers(ready.limits))
+    return jax.tree.map(jnp.asarray, ready)
 
 
 def _spec(task: Task, num_samples: int, noise: NoiseSpec) -> MppiSpec:

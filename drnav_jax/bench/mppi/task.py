@@ -12,7 +12,7 @@ without smoothing or clamps, which `pytorch_mppi` has not. Costmap and risk hold
 here represents exactly, and are read at the cell under the robot's centre.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +91,8 @@ def make(num_steps: int = 56, seed: int = 0, size: int = 256, resolution: float 
         occupied[row : row + 8, col : col + 8] = True
     middle, free = size // 2, int(0.6 / resolution)
     occupied[middle - free : middle + free, middle - free : middle + free] = False
-    distance = jnp.asarray(ndimage.distance_transform_edt(~occupied) * resolution, jnp.float32)
+    cells: Any = ndimage.distance_transform_edt(~occupied)
+    distance = jnp.asarray(cells * resolution, jnp.float32)
     cost = np.asarray(costmap.inflation(distance, RADIUS, InflationParams()), np.float32)
     centre = (np.arange(size) + 0.5) * resolution - 0.5 * size * resolution
     risk = np.exp(-(np.square(centre - 1.0)[:, None] + np.square(centre - 0.8)[None, :]))
