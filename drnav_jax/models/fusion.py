@@ -47,7 +47,7 @@ class FusionParams(NamedTuple):
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
     sight: Scalar = 5.0  # [] eq. 4 [m]
     closes: Scalar = 2.0  # [] eq. 4 [nat]
-    opens: Scalar = 2.0  # [] eq. 4 [nat]
+    opens: Scalar = 0.0  # [] eq. 4 [nat]; 0: nothing, for a wall taken for grass is a collision
     rule: GeometricParams = GeometricParams()  # an input of the network, and the answer where there is no camera
 
 
