@@ -44,9 +44,9 @@ def told(evaluation: Evaluation, spec: NavSpec, dt: float) -> Told:
     episodes = []
     for number, k in enumerate(evaluation.kept):
         ticks = []
-        for t in np.flatnonzero(log.active[k]):
+        for t in np.flatnonzero(log.active[k]).tolist():
             tick = {
-                "episode": number, "world": evaluation.trips[number].scene.name, "time_s": round(int(t) * dt, 3),
+                "episode": number, "world": evaluation.trips[number].scene.name, "time_s": round(t * dt, 3),
                 "mode": recovery.MODES[int(log.policy["mode"][k, t])],
                 "v": _short(log.command[k, t, 0]), "omega": _short(log.command[k, t, 1]),
                 "g": [_short(x) for x in log.policy["local_goal"][k, t]],
