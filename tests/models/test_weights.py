@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from small_network import SPEC, params_of
 
 from drnav_jax.models import weights
 from drnav_jax.models.calibration import Calibration, Temperature
+from drnav_jax.models.network import NetworkSpec
 
 pytestmark = pytest.mark.relaxed  # flax
 HELD = Calibration(path=Temperature(1.25, -0.5), dead=Temperature(jnp.asarray(2.0), jnp.asarray(0.25)))
@@ -143,3 +145,13 @@ def test_a_kill_while_writing_leaves_the_old_file(file, params, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         weights.save(file, SPEC, jax.tree.map(jnp.zeros_like, params), HELD, {})
     assert file.read_bytes() == before
+
+
+def test_the_weights_that_come_along():
+    """What `--predictor fusion` and the model card rely on."""
+    trained = weights.load(expected=NetworkSpec())
+    assert weights.SHIPPED.stat().st_size < 12e6
+    card = (Path(__file__).resolve().parents[2] / "docs" / "model_card.md").read_text()
+    figures = trained.notes["figures"]
+    assert f"ways {100 * figures['accuracy']:.1f} %" in card and f"ECE {figures['ece']:.3f}" in card
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(trained.params))
