@@ -183,7 +183,7 @@ def beyond(commands: np.ndarray, delay: float, robot: RobotParams, dt: float, ti
     """How many commands are not numbers, or beyond the limits (module docstring)."""
     low, high = np.array([robot.v_min, -robot.w_max]), np.array([robot.v_max, robot.w_max])
     rate = np.array([robot.a_max, robot.alpha_max]) * dt
-    finite = np.isfinite(commands).all(axis=1)
+    finite = np.asarray(np.isfinite(commands).all(axis=1))
     known = np.where(finite[:, None], commands, 0.0)
     far = np.abs(known - motors(known, delay, robot, dt)) > rate + tiny
     wrong = ~finite | (known < low - tiny).any(axis=1) | (known > high + tiny).any(axis=1) | far.any(axis=1)
@@ -228,7 +228,7 @@ def driven(config: Config, planner: str) -> dict[str, dict[str, Any]]:
     cases = {name: CASES[name]() for name in config.named}
     trips = [trip_of(name, case, config.minutes * 60.0) for name, case in cases.items()]
     batch = evaluate.episode_params(trips, setup)
-    faults: Any = jax.tree.map(lambda *a: np.float32(a), *[case.faults for case in cases.values()])
+    faults: Any = jax.tree.map(lambda *a: np.asarray(a, np.float32), *[case.faults for case in cases.values()])
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
     progress = lambda done: print(f"\radversarial: {planner} {done}/{len(trips)} ", end="", file=sys.stderr)  # noqa: E731
     result = episode.run(SPEC, evaluate.policy_of(setup.nav), batch._replace(faults=faults), keys, progress=progress)
