@@ -312,13 +312,14 @@ def _act(
     margin = params.score.margin
     score = params.score._replace(margin=jnp.where(squeeze, jnp.minimum(params.route.squeeze_margin, margin), margin))
     choice = goal_generator.given(spec.generator, seen.goal)
-    if planner.generates or planner.recovery == "drnav":
-        made = goal_generator.generate(
-            spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
-            jnp.asarray(params.hysteresis, jnp.float32),
-        )  # fmt: skip
-        back = recover.mode == behaviour.RETREAT  # along the route, whoever drives
-        choice = jax.tree.map(lambda a, b: a if planner.generates else jnp.where(back, a, b), made, choice)
+    make = lambda: goal_generator.generate(  # noqa: E731
+        spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
+        jnp.asarray(params.hysteresis, jnp.float32),
+    )  # fmt: skip
+    if planner.generates:
+        choice = make()
+    elif planner.recovery == "drnav":  # back along the route, whoever drives
+        choice = jax.lax.cond(recover.mode == behaviour.RETREAT, make, lambda: choice)
     if planner.recovery == "drnav":
         risky = jnp.asarray(False)
         if planner.exposure and not planner.risk_in_route:  # a route that prices risk turns away by itself
