@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from scipy.special import expit
 
 from drnav_jax import bags, report, viz
 from drnav_jax.filter import FilterParams, FilterSpec, belief
@@ -132,10 +133,6 @@ def _share(mask: np.ndarray, among: np.ndarray) -> float:
     return float(mask[among].mean()) if among.any() else math.nan
 
 
-def _logistic(logits: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.asarray(logits, np.float64)))
-
-
 def figures(said: Said, blind: Said) -> dict[str, Any]:
     """Figures of one frame.
 
@@ -147,9 +144,9 @@ def figures(said: Said, blind: Said) -> dict[str, Any]:
     free, taken = np.asarray(said.known) == FREE, np.asarray(said.known) == OCCUPIED
     return {
         "path_logits": dict(zip(WAYS, np.asarray(said.path, float).tolist(), strict=True)),
-        "p_open": dict(zip(WAYS, _logistic(said.path).tolist(), strict=True)),
-        "p_open_without_camera": dict(zip(WAYS, _logistic(blind.path).tolist(), strict=True)),
-        "p_dead_end": float(_logistic(said.flag)),
+        "p_open": dict(zip(WAYS, expit(said.path).tolist(), strict=True)),
+        "p_open_without_camera": dict(zip(WAYS, expit(blind.path).tolist(), strict=True)),
+        "p_dead_end": float(expit(said.flag)),
         "dead_end": bool(said.flag > 0),
         "share_judged": float(judged.mean()),
         "share_dead": _share(said.p_dead > 0.5, judged),
@@ -178,7 +175,7 @@ def picture(frame: bags.Recorded, said: Said, number: int, since: float) -> viz.
         title=f"{number + 1}   {frame.time - since:.1f} s", photos=[p for p in frame.photos if p is not None],
         cloud=frame.cloud, points=np.asarray(seen.points)[np.asarray(seen.point_valid)],
         local_map=np.asarray(said.known), judged=np.asarray(said.judged), p_dead=np.asarray(said.p_dead),
-        traversable=np.asarray(said.traversable), p_open=_logistic(said.path), p_flag=float(_logistic(said.flag)),
+        traversable=np.asarray(said.traversable), p_open=expit(said.path), p_flag=float(expit(said.flag)),
     )  # fmt: skip
 
 

@@ -37,18 +37,13 @@ def growth(file: str | Path, curves: Mapping[str, Curve], title: str = "") -> Pa
     Raises:
         MissingExtra: If matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-        from matplotlib.ticker import NullLocator
-    except ImportError as error:
-        raise look.MissingExtra from error
-    file = Path(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
     columns = min(COLUMNS, len(curves))
     rows = -(-len(curves) // columns)
-    figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows + 0.4), dpi=DPI, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = look.page(PANEL[0] * columns, PANEL[1] * rows + 0.4, dpi=DPI, layout="constrained")
+    from matplotlib.ticker import NullLocator
+
+    file = Path(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
     panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     for axes, (name, curve) in zip(panels, curves.items(), strict=False):
         sizes, ms, mb = (np.asarray(a, float) for a in curve[1:])

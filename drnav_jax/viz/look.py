@@ -152,8 +152,8 @@ class MissingExtra(ImportError):
         super().__init__("pictures need the extra: pip install drnav_jax[viz]")
 
 
-def page(width: float, height: float) -> Any:
-    """An empty figure [inch].
+def page(width: float, height: float, *, dpi: int = DPI, layout: Any = None) -> Any:
+    """An empty figure [inch]; `layout` is matplotlib's.
 
     Raises:
         MissingExtra: If matplotlib is not installed.
@@ -163,7 +163,7 @@ def page(width: float, height: float) -> Any:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingExtra from error
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white", layout=layout)
     FigureCanvasAgg(figure)
     return figure
 

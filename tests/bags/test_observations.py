@@ -148,10 +148,16 @@ def test_the_tolerance_is_checked():
         BagSpec(tolerance=-0.1)
 
 
+def recordings(shared_data, name):
+    """The folder of that name; not all copies of the data hold each."""
+    folder = shared_data / "bags" / name
+    if not folder.is_dir():
+        pytest.skip(f"needs real recordings: {folder} is not there; DRNAV_DATA names the folder that holds bags/.")
+    return folder
+
+
 def test_the_kitti_frames(shared_data):
-    path = shared_data / "bags" / "kitti_0926"
-    if not path.is_dir():
-        pytest.skip(f"{path} is not there.")
+    path = recordings(shared_data, "kitti_0926")
     spec = BagSpec(base_frame="velodyne", base_height=1.73, level=True, scan=ScanSpec(min_range=2.0))
     found = observations(path, spec)
     assert len(found) == 16
@@ -169,9 +175,7 @@ def test_the_kitti_frames(shared_data):
 
 @pytest.mark.parametrize(("name", "metres"), [("radish_fr079", 40), ("radish_intel", 20)])
 def test_real_laser_drives(shared_data, name, metres):
-    path = shared_data / "bags" / name
-    if not path.is_dir():
-        pytest.skip(f"{path} is not there.")
+    path = recordings(shared_data, name)
     poses = []
     for recorded in read(path, BagSpec(base_height=0.3)):
         seen = recorded.observation
@@ -185,9 +189,7 @@ def test_real_laser_drives(shared_data, name, metres):
 
 
 def test_awkward_bags_give_errors_that_say_what(shared_data):
-    folder = shared_data / "bags" / "fixtures"
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is not there.")
+    folder = recordings(shared_data, "fixtures")
     bags = [*folder.rglob("*.bag"), *folder.rglob("*.txt"), *(file.parent for file in folder.rglob("metadata.yaml"))]
     assert len(bags) >= 8
     for bag in bags:
