@@ -232,6 +232,7 @@ class Evidence(NamedTuple):
     p_dead: Float[Array, "H W"]  # probability that the cell is a dead end
     confidence: Float[Array, "H W"]  # 0 = no evidence here (the belief is left alone) .. 1 = full weight
     blocked: Array | None = None  # [H, W] log-odds that something stops a robot [nat], 0 = no opinion; None: none at all
+    repeats: Scalar | None = None  # [] share by which it stands for earlier evidence too; None: 0, frames are independent
 
 
 class Command(NamedTuple):

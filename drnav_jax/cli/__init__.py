@@ -47,8 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     try:
         args = parse(argv)
-        process.cache_programs()
-        process.keep_memory()
+        process.prepare()
         return _perform(args)
     except SystemExit:
         return 0

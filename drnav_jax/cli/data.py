@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 from drnav_jax import dataset, gallery, report, sources
+from drnav_jax.cli import process
 from drnav_jax.cli.flags import Dataset, Worlds
 from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
 
@@ -41,7 +42,7 @@ def gather(args: Dataset) -> int:
     bar = Bar("dataset", args.frames, "frames")
     try:
         with stdout_kept(args.json):
-            manifest = dataset.write(args.out, spec, workers=args.workers, progress=bar)
+            manifest = dataset.write(args.out, spec, workers=args.workers, prepare=process.prepare, progress=bar)
     except KeyboardInterrupt:
         print(f"drnav: interrupted; run the same command again to go on in {args.out}/", file=sys.stderr)
         return INTERRUPTED

@@ -13,6 +13,12 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX, _ARENA_MAX = -1, -2, -4, -8
 _PAD = 256 << 20  # [bytes] by which the heap grows at least
 
 
+def prepare() -> None:
+    """What every process does first."""
+    cache_programs()
+    keep_memory()
+
+
 def cache_programs() -> None:
     """Keep compiled programs for the next command, unless somebody has already said where."""
     if jax.config.values["jax_compilation_cache_dir"] is not None:

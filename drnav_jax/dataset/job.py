@@ -1,8 +1,14 @@
 """The whole job of `drnav dataset`: what to gather, writing it, and what to show of it."""
 
 import dataclasses
+import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
+from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
@@ -50,13 +56,43 @@ def write(
     spec: FrameSpec = FrameSpec(),  # noqa: B008 (immutable)
     *,
     workers: int = 2,
+    prepare: Callable[[], Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
-    """Gather what is missing of a dataset; its manifest (`shards.write`)."""
+    """Gather what is missing of a dataset; its manifest (`shards.write`).
+
+    More than one worker are processes, which import the calling script anew (call this under `if __name__ == "__main__"`)
+    and begin with `prepare`.
+    """
     if workers < 1:
         raise ValueError(f"workers must be >= 1, got {workers}.")
     settings = {"frames": _plain(dataclasses.asdict(spec))}
-    return shards.write(out, data, settings, partial(gather.shard, data, spec), workers=workers, progress=progress)
+    make = partial(gather.shard, data, spec)
+    return shards.write(out, data, settings, make, workers=workers, pool=partial(_pool, prepare), progress=progress)
+
+
+def _pool(prepare: Callable[[], Any] | None, workers: int) -> Executor:
+    """Processes, since half of the work is Python's: threads would wait for each other."""
+    if workers == 1:
+        return ThreadPoolExecutor(1)
+    spawn = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=spawn, initializer=_begin, initargs=(prepare,))
+
+
+def _begin(prepare: Callable[[], Any] | None) -> None:
+    """A worker: Ctrl-C is heard by the process that it works for, and it does not outlive that one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_follow, daemon=True).start()
+    if prepare is not None:
+        prepare()
+
+
+def _follow() -> None:
+    """End with the process that this one works for, however that one ends."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)
 
 
 def _plain(tree: Any) -> Any:

@@ -13,7 +13,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +131,7 @@ def write(
     make: Callable[[int], Frame],
     *,
     workers: int = 2,
+    pool: Callable[[int], Executor] = ThreadPoolExecutor,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Write what is missing of a dataset; the manifest.
@@ -141,6 +142,7 @@ def write(
         settings: What else the content depends on (sensors, versions); JSON values.
         make: Number of a shard -> all of its frames (a short last shard is cut off here).
         workers: Shards made side by side; the content does not depend on it.
+        pool: Number of workers -> what they are; processes must be able to pickle `make`.
         progress: Called with frames done and frames made in this run.
 
     Raises:
@@ -162,26 +164,29 @@ def write(
     done = spec.num_frames - sum(spec.frames_of(k) for k in missing)
     made = 0
 
-    def one(shard: int) -> int:
+    def keep(shard: int, frames: Frame) -> None:
+        nonlocal made
         count = spec.frames_of(shard)
-        frames = make(shard)
         fields = checked(Frame(*(np.asarray(a)[:count] for a in frames)), count)
         _replace(out / _name(shard), safetensors.numpy.save(fields))
-        return count
+        made += count
 
-    with ThreadPoolExecutor(max(1, workers)) as pool:
+    with pool(workers) as crew:
         waiting = iter(missing)
-        running = {pool.submit(one, k) for _, k in zip(range(workers), waiting, strict=False)}
+        running = {crew.submit(make, k): k for _, k in zip(range(workers), waiting, strict=False)}
         try:
             while running:
-                over, running = wait(running, return_when=FIRST_COMPLETED)
-                for task in over:
-                    made += task.result()
-                    running |= {pool.submit(one, k) for _, k in zip(range(1), waiting, strict=False)}
+                for task in wait(running, return_when=FIRST_COMPLETED).done:
+                    keep(running[task], task.result())
+                    del running[task]
+                    running |= {crew.submit(make, k): k for _, k in zip(range(1), waiting, strict=False)}
                 if progress is not None:
                     progress(done + made, made)
         except BaseException:
-            pool.shutdown(cancel_futures=True)  # what runs is written whole, what waits is not begun
+            crew.shutdown(cancel_futures=True)  # what is being made is kept, what waits is not begun
+            for task, shard in running.items():
+                if not task.cancelled() and task.exception() is None:
+                    keep(shard, task.result())
             raise
     manifest = _manifest(out, spec, plan)
     _replace(out / "manifest.json", (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode())

@@ -8,6 +8,13 @@ The weight w is 1 in the paper; here it is `gain` times the confidence of the ev
 the cell is not visible or the evidence is not finite. `gain` < 1 tempers successive frames, which
 are not independent. Before (5) the belief may forget: l <- l_0 + (l - l_0) exp(-forgetting dt).
 
+A predictor that reads the accumulated map says in each frame what it has said before, so a lasting doubt of p^ = 0.3 would
+add up to certainty. Of such evidence, which repeats a share r of what came before it, only the rest of the belief is kept:
+
+    l <- l_0 + (l - l_0) (1 - r w)                                                             (7)
+
+With r = 1 the belief tends to p^ itself, by the share w in each frame.
+
 Risk is what lies above the prior, (P - p_0) / (1 - p_0) and never below 0, so cells without
 evidence add none. P^foot is the mean of P (or of the risk) over the cells that the robot covers,
 weighted by the covered share of each.
@@ -86,6 +93,8 @@ def update(
     p_hat = jnp.clip(jnp.where(used, p_hat, 0.5), _P_MIN, 1 - _P_MIN)
     gained = weight * (jnp.log(p_hat / (1 - p_hat)) - l_0)
     kept = l_0 + (log_odds - l_0) * jnp.exp(-params.forgetting * dt)
+    if evidence.repeats is not None:
+        kept = l_0 + (kept - l_0) * (1.0 - jnp.clip(evidence.repeats, 0.0, 1.0) * jnp.minimum(weight, 1.0))
     return jnp.clip(kept + gained, params.l_min, params.l_max)
 
 

@@ -7,7 +7,8 @@ cell's answer weighs:
     (2)  w = 1 where a sensor has seen the cell free, `unseen` where it has not but has seen one within `NEAR`, else 0
     (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
 
-`weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper).
+`weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper). And since
+the network reads the map that earlier frames made, what it says `repeats` most of what it said (`filter.dead_end`, eq. 7).
 
 What it says of traversability corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with no
 return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass,
@@ -42,6 +43,7 @@ class FusionParams(NamedTuple):
     network: Any  # from `network.init` or `weights.load`
     calibration: Calibration = Calibration()
     weight: Scalar = 0.35  # [] of one frame's answer
+    repeats: Scalar = 1.0  # [] share of earlier answers that an answer stands for
     unseen: Scalar = 0.6  # [] w of eq. 2
     still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
@@ -146,6 +148,7 @@ def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMa
         p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
         confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
         barred = blocked(spec, params, observation, known, out.traversable)
-        return evidence(spec, observation.pose, p_dead, confidence, barred, local_map)
+        found = evidence(spec, observation.pose, p_dead, confidence, barred, local_map)
+        return found._replace(repeats=jnp.asarray(params.repeats, jnp.float32))
 
     return predict

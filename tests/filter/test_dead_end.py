@@ -98,6 +98,23 @@ def test_contradiction_flips_a_saturated_cell_as_fast_as_the_clip_says():
         assert float(belief[0, 0]) == (PARAMS.l_max if p else PARAMS.l_min)
 
 
+def test_what_repeats_itself_tends_to_what_it_says_and_no_further():
+    """Eq. 7: l_n = l_0 + (1 - (1 - w)^n) (logit p^ - l_0) for r = 1; r = 0 adds up, as does evidence that does not say."""
+    said = evidence(0.3, 0.35)
+    ones = {r: said._replace(repeats=None if r is None else jnp.float32(r)) for r in (None, 0.0, 0.5, 1.0, 7.0)}
+    beliefs = dict.fromkeys(ones, prior())
+    for n in range(1, 13):
+        beliefs = {r: dead_end.update(PARAMS, belief, ones[r], ALL, 0.1) for r, belief in beliefs.items()}
+        expected = L0 + (1 - 0.65**n) * (math.log(0.3 / 0.7) - L0)
+        np.testing.assert_allclose(beliefs[1.0], expected, rtol=1e-5)
+    np.testing.assert_array_equal(beliefs[0.0], beliefs[None])
+    np.testing.assert_array_equal(beliefs[7.0], beliefs[1.0])  # kept within 0..1
+    p = {r: float(dead_end.probability(belief)[0, 0]) for r, belief in beliefs.items()}
+    assert p[None] > 0.99 and p[1.0] < 0.3 and p[1.0] < p[0.5] < p[None]
+    held = dead_end.update(PARAMS, beliefs[None], ones[1.0], jnp.zeros(SHAPE, bool), 0.1)
+    np.testing.assert_array_equal(held, beliefs[None])  # nothing is said of what is out of view
+
+
 def test_forgetting_returns_to_the_prior_at_its_rate():
     params = PARAMS._replace(forgetting=0.5)
     belief = prior() + 4.0
