@@ -16,7 +16,7 @@ from test_workers import begun, identity
 
 if __name__ == "__main__":
     with job._pool(begun, 2) as pool:
-        found = list(pool.map(identity, range(2)))
+        found = list(pool.map(identity, [os.path.dirname(__file__)] * 2))
         print(*(pid for pid, _, _ in found), all(ready and deaf for _, ready, deaf in found), flush=True)
         time.sleep(60)
 """
@@ -28,8 +28,11 @@ def begun():
     ready = True
 
 
-def identity(_):
-    time.sleep(1.0)  # so that the other worker takes the other task
+def identity(folder):
+    """Of the process, once two of them have come to `folder`."""
+    Path(folder, f"{os.getpid()}.here").touch()
+    while len(list(Path(folder).glob("*.here"))) < 2:
+        time.sleep(0.05)
     return os.getpid(), ready, signal.getsignal(signal.SIGINT) is signal.SIG_IGN
 
 
@@ -42,7 +45,7 @@ def alive(pid):
 
 def test_one_worker_is_no_process():
     with job._pool(begun, 1) as pool:
-        assert pool.submit(identity, 0).result()[0] == os.getpid()
+        assert pool.submit(os.getpid).result() == os.getpid()
 
 
 def test_processes_are_prepared_and_do_not_outlive_a_kill(tmp_path):
