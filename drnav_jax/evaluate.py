@@ -146,7 +146,7 @@ def spec_of(
 
 @functools.cache
 def policy_of(spec: NavSpec, explained: bool = False) -> episode.Policy:
-    """The navigator as the simulator wants it; it logs mode, g*, EDE, P_dead and recoveries of every tick.
+    """The navigator as the simulator wants it; it logs mode, g*, EDE, P_dead, recoveries and arrival of every tick.
 
     Args:
         spec: The robot.
@@ -161,6 +161,7 @@ def policy_of(spec: NavSpec, explained: bool = False) -> episode.Policy:
         log = {
             "mode": info.mode, "local_goal": info.local_goal.xy, "exposure": info.local_goal.exposure,
             "p_dead": info.p_dead, "recoveries": info.recoveries, "certified": info.track.certified,
+            "arrived": info.arrived,
         }  # fmt: skip
         if explained:
             goal = info.local_goal

@@ -4,8 +4,9 @@
 
 Each case is a small world with a trip, a fault of the body, or both; the robot has five minutes. It shall not collide,
 command nothing that is not a number or beyond what it can do, and not go on for ever: at the end it is at the goal, or it
-stands still and says so (mode "stop" for the last `STILL` seconds). A command is beyond the limits if it is outside the
-robot's speeds, or farther from the measured speeds than its accelerations allow for within a tick.
+stands still and says so (mode "stop", or that it has arrived, for the last `STILL` seconds). A robot whose odometry drifts
+arrives where it takes the goal to be: off by no more than the drift of its way. A command is beyond the limits if it is
+outside the robot's speeds, or farther from the measured speeds than its accelerations allow for within a tick.
 """
 
 import dataclasses
@@ -29,6 +30,7 @@ from drnav_jax.worlds import Scene, World, make_world
 
 RADIUS = 0.25  # [m]
 STILL = 5.0  # [s]
+TOLERANCE = 0.75  # [m]
 SPEC = EpisodeSpec(chunk_ticks=10)
 
 
@@ -164,7 +166,7 @@ def trip_of(name: str, case: Case, limit: float) -> Trip:
     """The case as a trip, though its goal may not be reachable."""
     nothing = np.zeros((2, 2), bool)
     scene = Scene(name, case.world, nothing, (0.0, 0.0), 0.1, start=case.start, goal=case.goal)
-    return Trip(scene, math.nan, np.zeros((0, 2)), limit, 0.75)
+    return Trip(scene, math.nan, np.zeros((0, 2)), limit, TOLERANCE)
 
 
 def motors(commands: np.ndarray, delay: float, robot: RobotParams, dt: float) -> np.ndarray:
@@ -197,11 +199,13 @@ def judged(case: Case, result: episode.Result, k: int) -> dict[str, Any]:
     success, collision = bool(state.success[k]), bool(state.collision[k])
     numbers = all(np.isfinite(a).all() for a in jax.tree.leaves(log) if a.dtype == np.float32)
     last = round(STILL / dt)
-    stands = np.abs(log.command[-last:]).max() < 1e-3 and (log.policy["mode"][-last:] == recovery.STOP).all()
+    arrived = log.policy["arrived"][-last:].all()
+    stands = np.abs(log.command[-last:]).max() < 1e-3 and (arrived or (log.policy["mode"][-last:] == recovery.STOP).all())
     modes = np.bincount(log.policy["mode"], minlength=len(recovery.MODES)) * dt
     wrong = beyond(log.command.astype(float), float(case.faults.delay), RobotParams(radius=RADIUS), dt)
     return {
         "success": success, "collision": collision, "stopped": bool(stands and not success and not collision),
+        "says_arrived": bool(arrived), "off_m": round(math.dist(case.goal, log.pose[-1, :2]), 2),
         "finite": bool(numbers), "beyond_limits": wrong, "time_s": round(ticks * dt, 1),
         "distance_m": round(float(state.distance[k]), 2), "min_clearance_m": round(float(state.min_clearance[k]), 3),
         "recoveries": int(log.policy["recoveries"][-1]),
@@ -217,7 +221,9 @@ def verdict(case: Case, found: dict[str, Any]) -> str:
         return "broken command"
     if not (found["success"] or found["stopped"]):
         return "livelock"
-    if case.arrives is not None and found["success"] != case.arrives:
+    drifted = float(case.faults.drift_distance) * found["distance_m"]
+    arrived = found["success"] or (found["says_arrived"] and found["off_m"] <= TOLERANCE + drifted)
+    if case.arrives is not None and arrived != case.arrives:
         return "gave up" if case.arrives else "impossible"
     return "ok"
 

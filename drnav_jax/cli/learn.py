@@ -50,10 +50,14 @@ def perform(args: Train) -> int:
     else:
         worlds = dataset.spec_of(1, "train", spec.seed)
         source = lambda first: dataset.stream(spec.batch_size, worlds, first=first)  # noqa: E731
-    bar = Bar("train", spec.steps, "steps")
+    bar, reported = Bar("train", spec.steps, "steps"), []  # a resumed run has made what came since its first report
     try:
         with stdout_kept(args.json):
-            said = lambda step, figures: bar(step, note=_note(figures))  # noqa: E731
+
+            def said(step: int, figures: dict[str, float]) -> None:
+                reported.append(step)
+                bar(step, step - reported[0], note=_note(figures))
+
             result = train.train(
                 spec, source, validation, args.out, resume=args.resume, progress=said, data=_about(args)
             )
