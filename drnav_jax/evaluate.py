@@ -217,6 +217,21 @@ def label_map(trip: Trip, radius: float) -> GridMap:
     return GridMap(values=values, origin=origin, resolution=_float32(known.resolution))
 
 
+def values_at(grid: Any, values: np.ndarray, xy: np.ndarray, fill: float = 0.0) -> np.ndarray:
+    """Values `[N]` of the cells under points (host code).
+
+    Args:
+        grid: `GridMap` or `GroundTruth`: whose `origin` and `resolution` count.
+        values: `[H, W]` on it.
+        xy: `[N, 2]` [m].
+        fill: Off the grid.
+    """
+    j, i = np.floor((np.asarray(xy) - np.asarray(grid.origin)) / float(grid.resolution)).astype(int).T
+    h, w = values.shape
+    held = (i >= 0) & (i < h) & (j >= 0) & (j < w)
+    return np.where(held, values[np.clip(i, 0, h - 1), np.clip(j, 0, w - 1)], fill)
+
+
 def params_of(setup: Setup) -> NavParams:
     """The navigator's parameters under this setup, before any world is known."""
     params = NavParams()

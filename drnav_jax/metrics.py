@@ -102,14 +102,17 @@ def ratio_of_means(
         (ratio, lower, upper).
 
     Raises:
-        ValueError: If the samples are not paired or empty.
+        ValueError: If the samples are not paired or empty, or all of theirs are 0.
     """
     ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
     if ours.shape != theirs.shape or ours.ndim != 1 or not ours.size:
         raise ValueError(f"paired samples must be [N] with N >= 1, got {ours.shape} and {theirs.shape}.")
+    if not theirs.any():
+        raise ValueError("a ratio over nothing but zeros is none.")
     draw = np.random.default_rng(seed).integers(0, ours.size, (resamples, ours.size))
-    ratios = ours[draw].mean(axis=1) / theirs[draw].mean(axis=1)
-    low, high = np.quantile(ratios, [(1 - level) / 2, (1 + level) / 2])
+    with np.errstate(divide="ignore", invalid="ignore"):  # a sample may hold nothing but zeros of theirs, or of both
+        ratios = ours[draw].mean(axis=1) / theirs[draw].mean(axis=1)
+    low, high = np.quantile(ratios[~np.isnan(ratios)], [(1 - level) / 2, (1 + level) / 2])
     return float(ours.mean() / theirs.mean()), float(low), float(high)
 
 

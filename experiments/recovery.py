@@ -90,20 +90,12 @@ def setup_of(config: Config, row: str) -> Setup:
     )  # fmt: skip
 
 
-def at(true: GroundTruth, values: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Values of the cells under points `[N, 2]` [m]; 0 off the grid."""
-    j, i = np.floor((np.asarray(xy) - true.origin) / true.resolution).astype(int).T
-    h, w = values.shape
-    held = (i >= 0) & (i < h) & (j >= 0) & (j < w)
-    return np.where(held, values[np.clip(i, 0, h - 1), np.clip(j, 0, w - 1)], 0)
-
-
 def trapped(config: Config, family: str, seed: int, cache: Path) -> Trapped | None:
     """A trip out of a dead end of this world; None where there is none of the depths, or the goal lies in one."""
     scene = worlds.sample(family, seed)
     assert scene.goal is not None
     true = truth(scene, TruthSpec(), cache=cache)
-    if at(true, true.label, np.asarray([scene.goal]))[0]:
+    if evaluate.values_at(true, true.label, np.asarray([scene.goal]))[0]:
         return None
     depth = np.asarray(true.depth, float)
     margin = evaluate.plan_margin(evaluate.NavParams())
@@ -146,11 +138,11 @@ def judged(one: Trapped, path: np.ndarray, limit: float) -> dict[str, Any]:
         path: Places `[T, 2]` of all ticks, the start first [m].
         limit: Time that counts where it never escaped [s].
     """
-    inside = at(one.true, np.asarray(one.true.pocket), path) == one.pocket
+    inside = evaluate.values_at(one.true, np.asarray(one.true.pocket), path) == one.pocket
     out = np.flatnonzero(~inside)
     if not len(out):
         return {"escaped": False, "escape_s": limit, "entered_again": False}
-    deep = inside & (at(one.true, np.asarray(one.true.depth, float), path) > DEEP)
+    deep = inside & (evaluate.values_at(one.true, np.asarray(one.true.depth, float), path) > DEEP)
     return {"escaped": True, "escape_s": DT * int(out[0]), "entered_again": bool(deep[out[0] :].any())}
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from drnav_jax import evaluate
 from drnav_jax.evaluate import Setup
 from experiments import recovery
 from experiments.recovery import Config
@@ -17,10 +18,10 @@ def trip(tmp_path_factory):
 def test_trips_start_in_dead_ends_and_lead_out_of_them(trip):
     x, y, _ = trip.trip.scene.start
     true = trip.true
-    assert recovery.at(true, true.label, np.array([[x, y]]))[0] and trip.pocket > 0
+    assert evaluate.values_at(true, true.label, np.array([[x, y]]))[0] and trip.pocket > 0
     assert 0.8 <= trip.depth <= 3.0
-    assert recovery.at(true, np.asarray(true.depth), np.array([[x, y]]))[0] == pytest.approx(trip.depth)
-    assert not recovery.at(true, true.label, np.array([trip.trip.scene.goal]))[0]
+    assert evaluate.values_at(true, np.asarray(true.depth), np.array([[x, y]]))[0] == pytest.approx(trip.depth)
+    assert not evaluate.values_at(true, true.label, np.array([trip.trip.scene.goal]))[0]
 
 
 def test_escape_and_entering_again(trip):
