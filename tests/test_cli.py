@@ -182,7 +182,11 @@ def test_run_prints_a_table_and_cleans_up_after_itself(capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ("planner", "parts", "term"),
-    [("grid", {"goal", "command"}, "progress"), ("dwa", {"command"}, "heading"), ("nav2-dwb", {"command"}, "PathDist")],
+    [
+        ("grid", {"goal", "command"}, "progress"),
+        pytest.param("dwa", {"command"}, "heading", marks=pytest.mark.slow),
+        pytest.param("nav2-dwb", {"command"}, "PathDist", marks=pytest.mark.slow),
+    ],
 )
 def test_explain_says_which_critic_decided(capsys, planner, parts, term):
     flags = ("run", "--world", "u:0", "--episodes", "2", "--time-limit", "1", "--planner", planner, "--no-pictures")

@@ -5,7 +5,8 @@ Two beliefs beside the occupancy, in log-odds; 0 = nothing is known:
     hole(c)     the ground is missing. A beam that ends below the ground, at z < -`depth`, has passed z = 0 over c, where
                 there is no ground; one that ends on the ground (|z| < `depth`) has found some.                          (1)
     barrier(c)  a camera's opinion that something stops a robot (`Evidence.blocked`): > 0 a pane of glass that beams go
-                through, < 0 tall grass that they return from. Evidence adds up; a predictor tempers its own.            (2)
+                through, < 0 tall grass that they return from. Evidence adds up; a predictor tempers its own. It falls
+                below 0 only where there are returns: what is free is no grass.                                          (2)
 
     closed = (occupied and barrier > -`opened`) or hole > 0 or barrier > `closed`                                        (3)
 
@@ -76,10 +77,12 @@ def observe(
 
 
 def assimilate(
-    params: BarrierParams, barrier: Float[Array, "H W"], blocked: Float[Array, "H W"]
+    params: BarrierParams, barrier: Float[Array, "H W"], blocked: Float[Array, "H W"], occupied: Bool[Array, "H W"]
 ) -> Float[Array, "H W"]:
     """Equation (2): the belief after a predictor's opinion, in log-odds [nat]; what is not finite is none."""
-    return jnp.clip(barrier + jnp.where(jnp.isfinite(blocked), blocked, 0.0), -params.limit, params.limit)
+    said = jnp.where(jnp.isfinite(blocked), blocked, 0.0)
+    least = jnp.where(occupied, -params.limit, jnp.minimum(barrier, 0.0))
+    return jnp.clip(jnp.maximum(barrier + said, least), -params.limit, params.limit)
 
 
 def closed(

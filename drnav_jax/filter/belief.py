@@ -213,4 +213,5 @@ def assimilate(
     state = state._replace(dead_end=belief)
     if evidence.blocked is None:
         return state
-    return state._replace(barrier=barrier.assimilate(params.barrier, state.barrier, evidence.blocked))
+    occupied = state.seen & (state.occupancy > 0)
+    return state._replace(barrier=barrier.assimilate(params.barrier, state.barrier, evidence.blocked, occupied))

@@ -10,10 +10,14 @@ cell's answer weighs:
 `weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper). And since
 the network reads the map that earlier frames made, what it says `repeats` most of what it said (`filter.dead_end`, eq. 7).
 
-What it says of traversability corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with no
-return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass,
+What it says of traversability, t, corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with
+no return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass. Within `sight`
 
-    (4)  blocked(c) = `weight` m logit(1 - t(c)) within `sight` of the robot, kept within -`opens`..`closes`; 0 elsewhere
+    (4)  blocked(c) = m [`pane` - logit t(c)], kept within -`clears`..`closes`     where LiDAR holds c to be free
+         blocked(c) = -m logit t(c), kept within -`opens`..`opens`                 where it holds c to be occupied
+
+and 0 elsewhere. Panes are rare: `pane` lies above 0, since where t(c) is less than certain at a metre's distance a pane is
+likelier than floor (measured in `docs/model_card.md`).
 """
 
 import functools
@@ -48,7 +52,9 @@ class FusionParams(NamedTuple):
     still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
     sight: Scalar = 5.0  # [] eq. 4 [m]
+    pane: Scalar = 1.2  # [] eq. 4 [nat]
     closes: Scalar = 2.0  # [] eq. 4 [nat]
+    clears: Scalar = 2.0  # [] eq. 4 [nat]
     opens: Scalar = 0.0  # [] eq. 4 [nat]; 0: nothing, for a wall taken for grass is a collision
     rule: GeometricParams = GeometricParams()  # an input of the network, and the answer where there is no camera
 
@@ -113,8 +119,9 @@ def blocked(
     asked = returned | ((known == FREE) & ~_grown(returned, 1))
     x, y = geometry.cell_centres(spec.bev.shape, jnp.asarray(spec.bev.origin, jnp.float32), spec.bev.resolution)
     asked &= (x * x + y * y <= jnp.square(params.sight)) & jnp.isfinite(traversable)
-    said = jnp.clip(-traversable, -params.opens, params.closes)
-    return jnp.where(asked & jnp.any(observation.image_valid), params.weight * _moves(params, observation) * said, 0.0)
+    grass, pane = jnp.clip(-traversable, -params.opens, params.opens), params.pane - traversable
+    said = jnp.where(returned, grass, jnp.clip(pane, -params.clears, params.closes))
+    return jnp.where(asked & jnp.any(observation.image_valid), _moves(params, observation) * said, 0.0)
 
 
 def evidence(

@@ -20,6 +20,7 @@ def result():
         return bench.run(quick=True)
 
 
+@pytest.mark.slow
 def test_every_figure_is_there(result):
     assert set(result) == {
         "tick_lidar_ms", "network_ms", "network", "tick_fusion_ms", "scoring", "scoring_error", "plan_ms",
@@ -37,6 +38,7 @@ def test_every_figure_is_there(result):
     assert json.loads(json.dumps(result, allow_nan=False)) == result
 
 
+@pytest.mark.slow
 def test_figures_fit_together(result):
     tick = result["tick_lidar_ms"]
     assert 0 < tick["median"] <= tick["p95"] <= tick["max"] and tick["replan_median"] <= tick["replan_p95"]
@@ -60,6 +62,7 @@ def test_figures_fit_together(result):
     assert lidar["max_error_m"] < 1e-3 and lidar["mismatches"] == 0
 
 
+@pytest.mark.slow
 def test_parts_of_the_planner_fit_together(result):
     plan, route = (result["planning"][k] for k in ("plan", "cost_to_go"))
     assert result["plan_ms"] == plan["both"] and result["cost_to_go_ms"] == route["full"]
@@ -74,10 +77,12 @@ def test_a_serpentine_has_one_long_way():
     assert value[-1, -1] > 36.0  # as the crow flies: 18 m
 
 
+@pytest.mark.slow
 def test_nobody_arrives_before_the_time_is_up(result):
     assert result["episodes"]["steps"] == 10 * result["episodes"]["batch"]
 
 
+@pytest.mark.slow
 def test_packed_words_score_almost_like_float_layers(result):
     error = result["scoring_error"]
     assert error["median_relative"] < 0.01 and error["p95_relative"] < 0.05
@@ -93,6 +98,7 @@ def test_difference_is_that_of_the_scores():
     assert blocked["blocked_in_one_only"] == 0.2 and blocked["choices_blocked"] == 1
 
 
+@pytest.mark.slow
 def test_table_names_every_part(result):
     text = bench.table(result)
     parts = ("tick, 4,096", "tick that replans", "65,536 x 56", "MPPI, ", "LiDAR", "camera 96x96", "MJX, 8 worlds of 20")

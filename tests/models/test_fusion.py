@@ -123,7 +123,7 @@ def test_what_it_says_of_panes_and_grass():
     known = rng.choice([UNKNOWN, FREE, OCCUPIED], (16, 40), p=[0.2, 0.75, 0.05]).astype(np.uint8)
     logits = (3 * rng.normal(size=known.shape)).astype(np.float32)
     logits[0, 0] = np.nan
-    params = FusionParams(None, weight=0.4, still=0.2, moving=0.3, sight=2.5, closes=1.5, opens=0.8)
+    params = FusionParams(None, weight=0.4, still=0.2, moving=0.3, sight=2.5, pane=0.7, closes=1.5, clears=1.1, opens=0.8)
     ask = lambda seen: np.asarray(fusion.blocked(spec, params, seen, jnp.asarray(known), jnp.asarray(logits)))  # noqa: E731
     got, count = ask(observed(twist=(0.9, 0.0))), {FREE: 0, OCCUPIED: 0}
     for i, j in np.ndindex(16, 40):
@@ -134,7 +134,9 @@ def test_what_it_says_of_panes_and_grass():
         if abs(math.hypot(x, y) - 2.5) < 1e-4:
             continue
         said = asked and math.hypot(x, y) < 2.5 and np.isfinite(logits[i, j])
-        want = 0.4 * min(max(-float(logits[i, j]), -0.8), 1.5) if said else 0.0
+        t = float(logits[i, j])
+        pair = (min(max(-t, -0.8), 0.8), min(max(0.7 - t, -1.1), 1.5))
+        want = pair[int(known[i, j] == FREE)] if said else 0.0
         assert got[i, j] == pytest.approx(want, abs=1e-6), (i, j)
         count[int(known[i, j])] = count.get(int(known[i, j]), 0) + (want != 0)
     assert count[FREE] > 20 and count[OCCUPIED] > 2
