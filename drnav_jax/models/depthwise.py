@@ -64,9 +64,9 @@ def depthwise(x: Float[Array, "n h w c"], kernel: Float[Array, "k k c"], stride:
 
 def grouped(x: Float[Array, "n h w c"], kernel: Float[Array, "k k c"], stride: int = 1) -> Float[Array, "n h2 w2 c"]:
     """`depthwise` by XLA's convolution."""
-    by = ((kernel.shape[0] // 2,) * 2,) * 2
+    half = kernel.shape[0] // 2
     return jax.lax.conv_general_dilated(
-        x, kernel[:, :, None, :], (stride, stride), by,
+        x, kernel[:, :, None, :], (stride, stride), ((half, half), (half, half)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"), feature_group_count=x.shape[-1],
     )  # fmt: skip
 
