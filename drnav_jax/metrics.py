@@ -6,6 +6,7 @@ NPR        = distance moved away from the goal / distance driven
 BARN       = success * T_opt / clip(T, 2 T_opt, 8 T_opt),  T_opt = reference length / 2 m/s
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,15 @@ def ratio_of_means(
         ratios = ours[draw].mean(axis=1) / theirs[draw].mean(axis=1)
     low, high = np.quantile(ratios[~np.isnan(ratios)], [(1 - level) / 2, (1 + level) / 2])
     return float(ours.mean() / theirs.mean()), float(low), float(high)
+
+
+def paired(values: Sequence[tuple[float, float]]) -> dict[str, Any] | None:
+    """`ratio_of_means` of (ours, theirs) as a record: ratio, low, high, trips; None of no pair, or if theirs are all 0."""
+    ours, theirs = np.asarray(values, float).reshape(-1, 2).T
+    if not theirs.any():
+        return None
+    ratio, low, high = ratio_of_means(ours, theirs)
+    return {"ratio": ratio, "low": low, "high": high, "trips": ours.size}
 
 
 def _pair(scores: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

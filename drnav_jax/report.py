@@ -75,10 +75,8 @@ def ratios(times: Mapping[str, Mapping[int, tuple[float, bool]]]) -> dict[str, A
     """
 
     def ratio(pairs: list[tuple[float, float]]) -> dict[str, Any] | None:
-        if not pairs:
-            return None
-        value, low, high = metrics.ratio_of_means(*np.asarray(pairs, float).T)
-        return {"ratio": round(value, 4), "low": round(low, 4), "high": round(high, 4), "trips": len(pairs)}
+        found = metrics.paired(pairs)
+        return found and {name: round(value, 4) for name, value in found.items()}
 
     first, *others = times
     out = {}

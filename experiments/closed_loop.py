@@ -174,15 +174,8 @@ def summed(ended: Evaluation, labels: list[GridMap]) -> dict[str, Any]:
 def against(ours: dict[str, Any], theirs: dict[str, Any]) -> dict[str, Any]:
     """Ratio of the times to the goal, of all trips and of those that both solve, and of the metres inside."""
     pairs = list(zip(ours["trips"].values(), theirs["trips"].values(), strict=True))
-
-    def ratio(name: str, chosen: list[tuple[Any, Any]]) -> dict[str, Any] | None:
-        values = np.asarray([(a[name], b[name]) for a, b in chosen], float)
-        if not len(values) or not values[:, 1].sum():
-            return None
-        mean, low, high = metrics.ratio_of_means(*values.T)
-        return {"ratio": mean, "low": low, "high": high, "trips": len(values)}
-
     both = [(a, b) for a, b in pairs if a["success"] and b["success"]]
+    ratio = lambda name, chosen: metrics.paired([(a[name], b[name]) for a, b in chosen])  # noqa: E731
     return {"time": ratio("time_s", pairs), "time_both": ratio("time_s", both), "inside": ratio("inside_m", pairs)}
 
 

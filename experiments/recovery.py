@@ -183,10 +183,7 @@ def summed(records: list[dict[str, Any]]) -> dict[str, Any]:
 def against(ours: list[dict[str, Any]], theirs: list[dict[str, Any]]) -> dict[str, Any] | None:
     """Ratio of the mean times to escape, on the trips that both escape."""
     both = [(a["escape_s"], b["escape_s"]) for a, b in zip(ours, theirs, strict=True) if a["escaped"] and b["escaped"]]
-    if not both:
-        return None
-    ratio, low, high = metrics.ratio_of_means(*np.asarray(both, float).T)
-    return {"ratio": ratio, "low": low, "high": high, "trips": len(both)}
+    return metrics.paired(both)
 
 
 def main(config: Config) -> dict[str, Any]:

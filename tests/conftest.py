@@ -37,7 +37,7 @@ hypothesis.settings.load_profile("drnav")
 
 # Files that take longest, longest first: two workers that take whole files end together only if none begins late.
 LONGEST = (
-    "test_suite", "test_evaluate", "test_cli", "test_step", "test_gather", "test_readme", "test_driving", "test_cli_learn",
+    "test_evaluate", "test_cli", "test_step", "test_gather", "test_readme", "test_driving", "test_cli_learn",
     "test_navigator", "test_job", "test_network", "test_fusion", "test_labels", "test_mjx", "test_families",
 )  # fmt: skip
 

@@ -50,13 +50,15 @@ def perform(args: Train) -> int:
     else:
         worlds = dataset.spec_of(1, "train", spec.seed)
         source = lambda first: dataset.stream(spec.batch_size, worlds, first=first)  # noqa: E731
-    bar, reported = Bar("train", spec.steps, "steps"), []  # a resumed run has made what came since its first report
+    begun: int | None = None
+    bar = Bar("train", spec.steps, "steps")
     try:
         with stdout_kept(args.json):
 
             def said(step: int, figures: dict[str, float]) -> None:
-                reported.append(step)
-                bar(step, step - reported[0], note=_note(figures))
+                nonlocal begun  # a resumed run has made what came since its first report
+                begun = step if begun is None else begun
+                bar(step, step - begun, note=_note(figures))
 
             result = train.train(
                 spec, source, validation, args.out, resume=args.resume, progress=said, data=_about(args)

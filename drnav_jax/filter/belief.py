@@ -110,9 +110,14 @@ def local_corner(spec: FilterSpec) -> tuple[int, int]:
     return (h - spec.local_cells) // 2, (w - spec.local_cells) // 2
 
 
+def occupied(state: FilterState) -> Bool[Array, "H W"]:
+    """Cells that LiDAR returned from, as believed."""
+    return state.seen & (state.occupancy > 0)
+
+
 def closed(params: FilterParams, state: FilterState) -> Bool[Array, "H W"]:
     """Cells that stop a robot: what LiDAR returned from, but for what does not (grass), and what it does not show."""
-    return barrier.closed(params.barrier, state.seen & (state.occupancy > 0), state.hole, state.barrier)
+    return barrier.closed(params.barrier, occupied(state), state.hole, state.barrier)
 
 
 def obstacles(spec: FilterSpec, params: FilterParams, state: FilterState) -> Bool[Array, "n n"]:
@@ -213,5 +218,4 @@ def assimilate(
     state = state._replace(dead_end=belief)
     if evidence.blocked is None:
         return state
-    occupied = state.seen & (state.occupancy > 0)
-    return state._replace(barrier=barrier.assimilate(params.barrier, state.barrier, evidence.blocked, occupied))
+    return state._replace(barrier=barrier.assimilate(params.barrier, state.barrier, evidence.blocked, occupied(state)))

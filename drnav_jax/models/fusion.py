@@ -16,8 +16,9 @@ no return in it or beside it, may be a pane of glass, and one that it holds to b
     (4)  blocked(c) = m [`pane` - logit t(c)], kept within -`clears`..`closes`     where LiDAR holds c to be free
          blocked(c) = -m logit t(c), kept within -`opens`..`opens`                 where it holds c to be occupied
 
-and 0 elsewhere. Panes are rare: `pane` lies above 0, since where t(c) is less than certain at a metre's distance a pane is
-likelier than floor (measured in `docs/model_card.md`).
+and 0 elsewhere. Of a pane t is rarely below a half, of floor it is nearly always far above: so `pane` lies above 0 nat (the
+model card has both distributions). Floor doubted in one frame is many times as frequent as a pane, so only doubt that
+lasts for some frames closes a cell.
 """
 
 import functools
