@@ -33,6 +33,8 @@ class Trained(NamedTuple):
     notes: dict[str, Any]  # data, seeds, figures: the model card in numbers
     sha256: str  # of the arrays
 
+ABLATED = ("attention_layers", "lift", "head", "sensors")  # settings of a network that may differ in `begun`
+
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
     found = {}
@@ -50,6 +52,12 @@ def _nested(flat: Mapping[str, np.ndarray]) -> dict[str, Any]:
             at = at.setdefault(part, {})
         at[last] = jnp.asarray(value, jnp.float32)
     return tree
+
+
+def _differences(mine: NetworkSpec, theirs: NetworkSpec) -> list[str]:
+    """Settings in which they differ."""
+    a, b = settings.plain(mine), settings.plain(theirs)
+    return [name for name in a if a[name] != b[name]]
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
@@ -115,8 +123,7 @@ def load(file: Path = SHIPPED, expected: NetworkSpec | None = None) -> Trained:
     except ValueError as error:
         raise ValueError(f"{file} is of another version ({error}): train it anew.") from None
     if expected is not None and spec != expected:
-        mine, theirs = settings.plain(expected), settings.plain(spec)
-        other = ", ".join(k for k in mine if mine[k] != theirs[k])
+        other = ", ".join(_differences(expected, spec))
         raise ValueError(f"{file} holds a network with another {other}: load it with its own Spec, or train it anew.")
     params = _nested(arrays)
     shapes = jax.tree.map(lambda a: a.shape, jax.eval_shape(lambda: network.init(jax.random.key(0), spec)))
@@ -124,3 +131,26 @@ def load(file: Path = SHIPPED, expected: NetworkSpec | None = None) -> Trained:
         raise ValueError(f"{file} does not hold the arrays of its network: this version builds another; train it anew.")
     temper = Calibration(**{name: Temperature(*pair) for name, pair in about["calibration"].items()})
     return Trained(spec, params, temper, about["notes"], metadata["sha256"])
+
+
+def begun(file: Path, spec: NetworkSpec, seed: int = 0) -> Any:
+    """Parameters to go on training from: a file's, as far as a network of this Spec has them, else random ones.
+
+    Args:
+        file: From `save`.
+        spec: May differ from the file's in what an ablation takes away (`ABLATED`), in nothing else.
+        seed: Of the random ones.
+
+    Raises:
+        ValueError: As `load`, or if the networks differ in anything else.
+        FileNotFoundError: If there is no such file.
+    """
+    held = load(file)
+    other = [name for name in _differences(spec, held.spec) if name not in ABLATED]
+    if other:
+        raise ValueError(
+            f"{file} holds a network with another {', '.join(other)}: to go on from it a network may differ in "
+            f"{', '.join(ABLATED)} only."
+        )
+    old, fresh = _flat(held.params), _flat(network.init(jax.random.key(seed), spec))
+    return _nested({k: old[k] if k in old and old[k].shape == a.shape else a for k, a in fresh.items()})

@@ -27,7 +27,7 @@ class TrainSpec:
         clip: Largest norm of a gradient.
         ema: Decay of the average of the parameters, which is what is shipped.
         seed: Of parameters, order and augmentation.
-        start_from: File of weights of the same network to go on from; "" = random ones.
+        start_from: File of weights to go on from (`weights.begun`); "" = random ones.
         validate_every: Steps between two validations.
         save_every: Steps between two checkpoints.
         keep: Checkpoints kept, beside the best.

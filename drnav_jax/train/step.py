@@ -52,7 +52,7 @@ def init(spec: TrainSpec) -> TrainState:
         OSError: If they cannot be read.
     """
     if spec.start_from:
-        params = jax.tree.map(jnp.asarray, weights.load(Path(spec.start_from), spec.network).params)
+        params = weights.begun(Path(spec.start_from), spec.network, spec.seed)
     else:
         params = network.init(jax.random.key(spec.seed), spec.network)
     average = jax.tree.map(jnp.copy, params)  # a buffer of its own: steps give their state's buffers away

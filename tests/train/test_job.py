@@ -131,6 +131,19 @@ def test_it_goes_on_from_weights(validation, tmp_path, whole):
     assert not (tmp_path / "other").exists() and not (tmp_path / "none").exists(), "nothing was begun"
 
 
+def test_an_ablation_goes_on_from_what_it_has_in_common(tmp_path, whole):
+    """A network without cameras takes over all but the arrays that read what cameras see."""
+    file = whole[0] / "weights.safetensors"
+    blind = dataclasses.replace(LEAST, sensors="lidar")
+    took, had = weights.begun(file, blind), weights.load(file).params
+    fresh = network.init(jax.random.key(0), blind)
+    assert jax.tree.map(np.shape, took) == jax.tree.map(np.shape, fresh) and "encoder" not in took
+    jax.tree.map(np.testing.assert_array_equal, took, {name: had[name] for name in took})
+    other = dataclasses.replace(LEAST, attention_layers=LEAST.attention_layers + 1)
+    more = weights.begun(file, other)["fusion"]
+    assert set(more) > set(had.get("fusion", {})), "what the file lacks begins at random"
+
+
 def test_it_refuses_what_is_not_its_own(whole, validation, tmp_path):
     out = whole[0]
     with pytest.raises(ValueError, match="holds a run already: give --resume"):
