@@ -2,8 +2,8 @@
 
 What is timed: the planner on a recorded drive (`drive`, `scorer`, `planner`), MPPI next to other implementations (`mppi`),
 the fusion network alone and in the tick (`network`), the LiDAR and the cameras (`lidar`, `camera`) and the physics
-(`physics`) against native MuJoCo, and batched closed-loop episodes (`episodes`). A fixed matmul from the same run tells a
-slow hour from slow code.
+(`physics`) against native MuJoCo, ground truth (`labels`), and batched closed-loop episodes (`episodes`). A fixed matmul
+from the same run tells a slow hour from slow code.
 """
 
 from typing import Any
@@ -12,6 +12,7 @@ from drnav_jax.bench import mppi
 from drnav_jax.bench.camera import camera_against_mujoco
 from drnav_jax.bench.drive import STRIDE, record, tick_times
 from drnav_jax.bench.episodes import episode_rate
+from drnav_jax.bench.labels import label_time
 from drnav_jax.bench.lidar import lidar_against_mujoco
 from drnav_jax.bench.machine import machine
 from drnav_jax.bench.network import network_times
@@ -31,7 +32,7 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         `tick_lidar_ms`, `network_ms`, `network` and `tick_fusion_ms` (`network`), `scoring` (candidate-steps per
         second by number of candidates), `scoring_error`, `plan_ms` (goal generator with 4,096 candidates and DWA),
         `cost_to_go_ms` (256x256), `planning` (both in parts), `mppi` (`mppi.side_by_side`), `lidar`, `camera`, `mjx`,
-        `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
+        `labels_ms` (400x400), `episodes_per_s`, `episodes`, `reference_matmul_ms`, `machine`.
     """
     warm_up = 5 if quick else 20
     drive = record(STRIDE if quick else warm_up + 200)
@@ -50,7 +51,8 @@ def run(*, quick: bool = False) -> dict[str, Any]:
         "tick_lidar_ms": tick_times(drive, warm_up), "network_ms": seeing["network"]["median"],
         "network": seeing["network"], "tick_fusion_ms": seeing["tick_fusion"], "scoring": rates, "scoring_error": error,
         "plan_ms": planning["plan"]["both"], "cost_to_go_ms": planning["cost_to_go"]["full"], "planning": planning,
-        "mppi": rivals, "lidar": lidar, "camera": camera, "mjx": physics, "episodes_per_s": per_second,
+        "mppi": rivals, "lidar": lidar, "camera": camera, "mjx": physics,
+        "labels_ms": label_time(1) if quick else label_time(5), "episodes_per_s": per_second,
         "episodes": episodes, "reference_matmul_ms": reference, "machine": machine(),
     }  # fmt: skip
 
@@ -113,6 +115,7 @@ def table(result: dict[str, Any]) -> str:
             f"{physics['steps_per_s'] / 1e3:.0f} k steps/s with contacts, {physics['ratio']:.2f} x MuJoCo; "
             f"kinematic {physics['kinematic_steps_per_s'] / 1e6:.1f} M ticks/s",
         ),
+        ("labels of 400x400 cells", f"{result['labels_ms']:.0f} ms"),
         ("episodes of 600 steps", f"{result['episodes_per_s']:.2f} /s ({episodes['batch']} in one call)"),
         ("matmul 1024^3 float32", f"{result['reference_matmul_ms']:.1f} ms"),
         ("machine", "{cores} x {cpu}, {device}, jax {jax}, python {python}".format(**result["machine"])),

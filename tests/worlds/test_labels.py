@@ -1,7 +1,5 @@
 """Dead-end labels: the case table, invariances, trips, and equality with brute force."""
 
-import time
-
 import jaxtyping
 import numpy as np
 import pytest
@@ -434,20 +432,3 @@ def test_real_floor_turned_and_mirrored(shared_data):
     for turn in (np.rot90, np.fliplr, np.flipud, np.transpose):
         turned = dead_ends(np.ascontiguousarray(turn(scene.occupied)), 0.1, LabelSpec(mouth=2.5)).label
         assert np.mean(turned == turn(label)) >= SYMMETRY
-
-
-@pytest.mark.slow
-def test_takes_half_a_second():
-    """400 x 400 cells with 60 walls: more gates than a floor of 40 m has. CPU time, the best of five."""
-    rng = np.random.default_rng(0)
-    occupied = np.zeros((400, 400), bool)
-    for _ in range(60):
-        (i, j), long = rng.integers(0, 400, 2), rng.integers(20, 120)
-        size = (3, long) if rng.random() < 0.5 else (long, 3)
-        occupied[i : i + size[0], j : j + size[1]] = True
-    took = []
-    for _ in range(5):
-        begin = time.process_time()
-        dead_ends(occupied, 0.1)
-        took.append(time.process_time() - begin)
-    assert min(took) <= 0.5
