@@ -42,7 +42,8 @@ def test_every_figure_is_there(result):
 def test_figures_fit_together(result):
     tick = result["tick_lidar_ms"]
     assert 0 < tick["median"] <= tick["p95"] <= tick["max"] and tick["replan_median"] <= tick["replan_p95"]
-    assert min(*result["scoring"].values(), *(result[k] for k in ("labels_ms", "episodes_per_s", "reference_matmul_ms"))) > 0
+    assert min(*result["scoring"].values(), result["episodes_per_s"]) > 0
+    assert min(result["labels_ms"], result["reference_matmul_ms"]) > 0
     alone, sees = result["network"], result["tick_fusion_ms"]
     assert 0 < result["network_ms"] == alone["median"] <= alone["p95"] <= alone["max"]
     assert sees["ticks"] == tick["ticks"] and 0 < sees["median"] <= sees["max"]
