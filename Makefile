@@ -14,7 +14,7 @@ export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow test-all lint bench lock clean
+.PHONY: help setup demo test test-long test-all lint bench lock clean
 
 help:  ## list the targets
 	@grep -E '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -31,12 +31,11 @@ $(STAMP): requirements.lock pyproject.toml
 demo: $(STAMP)  ## one trap, with and without dead-end prediction
 	$(BIN)/drnav compare $(DEMO_ARGS)
 
-test: $(STAMP)  ## the tests, but for the slow ones
-	$(BIN)/python -m pytest -q -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+test: $(STAMP)  ## the tests, but for the long and the slow ones
+	$(BIN)/python -m pytest -q -m "not slow and not long" -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-# All that is slow, but for hundreds of trips and hours of physics (tests/sim, tests/worlds, tests/experiments).
-test-slow: $(STAMP)  ## the slow tests that take minutes, not hours
-	$(BIN)/python -m pytest -q -m slow -n 2 $(filter-out tests/sim% tests/worlds% tests/experiments%,$(wildcard tests/*/ tests/test_*.py)) $(PYTEST_ARGS)
+test-long: $(STAMP)  ## those that `make test` leaves out for its length
+	$(BIN)/python -m pytest -q -m "long and not slow" -n 2 $(PYTEST_ARGS)
 
 test-all: $(STAMP)  ## every test, as users compile it
 	XLA_FLAGS="$(XLA_FLAGS)" $(BIN)/python -m pytest -q $(PYTEST_ARGS)

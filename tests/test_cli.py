@@ -130,7 +130,7 @@ def test_version(capsys):
     assert call(capsys, "--version") == (0, "drnav 0.1.0\n", "")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_compare_writes_the_same_bytes_again(capsys):
     flags = ("compare", *SHORT, "--planners", "drnav,dwa", "--json", "--out")
     code, out, err = call(capsys, *flags, "a")
@@ -185,11 +185,11 @@ def test_run_prints_a_table_and_cleans_up_after_itself(capsys, monkeypatch):
     ("planner", "parts", "term"),
     [
         ("grid", {"goal", "command"}, "progress"),
-        ("dwa", {"command"}, "heading"),
-        ("nav2-dwb", {"command"}, "PathDist"),
+        pytest.param("dwa", {"command"}, "heading", marks=pytest.mark.slow),
+        pytest.param("nav2-dwb", {"command"}, "PathDist", marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.slow
+@pytest.mark.long
 def test_explain_says_which_critic_decided(capsys, planner, parts, term):
     flags = ("run", "--world", "u:0", "--episodes", "2", "--time-limit", "1", "--planner", planner, "--no-pictures")
     code, text, _ = call(capsys, *flags, "--explain", "--out", "x")

@@ -56,7 +56,7 @@ def test_sets_that_are_too_small(capsys, tmp_path):
     assert not out.exists(), "nothing was begun"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.relaxed  # flax
 def test_a_short_training(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(network, "init", lambda key, spec: params_of(spec))  # which compiles for longer than all this takes

@@ -141,7 +141,7 @@ def agree(singles, batched, share):
     assert np.mean(np.abs(a - b) <= 0.02 * a) >= share
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_episode_in_a_batch_goes_as_it_goes_alone():
     agree(whole_episodes(["u", "t"], [3], 1, length=4.5), whole_episodes(["u", "t"], [3], 2, length=4.5), 1.0)
 

@@ -314,8 +314,8 @@ FOLLOWER = FollowerSpec(
 )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("planner", ["nav2-mppi", "nav2-dwb"])
+@pytest.mark.long
+@pytest.mark.parametrize("planner", ["nav2-mppi", pytest.param("nav2-dwb", marks=pytest.mark.slow)])
 def test_followers_of_a_route_drive_around_the_wall(planner):
     spec = dataclasses.replace(SPEC, planner=PLANNERS[planner], follower=FOLLOWER)
     drive = jax.jit(navigator.step.__wrapped__, static_argnames=("spec", "replan"))

@@ -31,7 +31,7 @@ def said(script: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_robot_arrives_and_the_planner_goes_around():
     drives, plans = blocks("python")
     assert said(drives).startswith("arrived: True, after ")

@@ -77,7 +77,7 @@ def in_pocket(family, seed, poses):
     return inside & pocket[cell[:, 0], cell[:, 1]]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("family", FAMILIES)
 def test_a_tour_looks_into_dead_ends_and_comes_out_again(family):
     poses, _ = driven(family)

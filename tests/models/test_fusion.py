@@ -246,7 +246,7 @@ NAV = NavSpec(
 )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_robot_drives_by_it_with_broken_sensors_too(params):
     nav = NavParams(predictor=params)
     step = jax.jit(

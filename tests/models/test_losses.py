@@ -102,7 +102,7 @@ def test_without_gamma_it_is_cross_entropy():
     assert float(focal[0]) < float(plain[0]) and float(focal[1]) == float(plain[1])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_halves_make_the_whole():
     """Values and gradients: devices add weights before they divide."""
     out, targets = case()

@@ -196,7 +196,7 @@ def test_inference_is_traced_once_per_shape():
         infer(SPEC, params, x)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_initial_parameters():
     """float32, of the stated shapes, another for another key; and near to indifferent about everything."""
     init = jax.jit(

@@ -140,7 +140,7 @@ def test_a_map_s_walls_are_met_and_passed_over():
         np.testing.assert_allclose(seen[-1, 16], 0.5 * 16 / 11.5, rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_level_rig_is_a_tilted_one_without_tilt():
     for veils in (False, True):
         a, b = (depth(MIXED, level=level, veils=veils) for level in (True, False))

@@ -455,7 +455,7 @@ ROWS_DRIVEN = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_both_physics_agree_in_open_space_and_on_what_a_collision_is():
     rough, fine = pursue(None, ROWS_DRIVEN).state, pursue(SPEC, ROWS_DRIVEN).state
     np.testing.assert_array_equal(fine.success, [True, True, True, False])

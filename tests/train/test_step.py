@@ -149,7 +149,7 @@ print(json.dumps({
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_devices_step_as_one(tmp_path):
     """In a process of its own, where the CPU counts as two devices; with the augmentation that training has."""
     ran = subprocess.run(
