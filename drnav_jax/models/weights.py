@@ -21,6 +21,7 @@ from drnav_jax.models.calibration import Calibration, Temperature
 from drnav_jax.models.network import NetworkSpec
 
 FORMAT = 1
+ABLATED = ("attention_layers", "lift", "head", "sensors")  # settings of a network that may differ in `begun`
 SHIPPED = Path(__file__).resolve().parent / "fusion.safetensors"
 
 
@@ -32,8 +33,6 @@ class Trained(NamedTuple):
     calibration: Calibration
     notes: dict[str, Any]  # data, seeds, figures: the model card in numbers
     sha256: str  # of the arrays
-
-ABLATED = ("attention_layers", "lift", "head", "sensors")  # settings of a network that may differ in `begun`
 
 
 def _flat(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
@@ -152,5 +151,7 @@ def begun(file: Path, spec: NetworkSpec, seed: int = 0) -> Any:
             f"{file} holds a network with another {', '.join(other)}: to go on from it a network may differ in "
             f"{', '.join(ABLATED)} only."
         )
+    if spec == held.spec:
+        return held.params
     old, fresh = _flat(held.params), _flat(network.init(jax.random.key(seed), spec))
     return _nested({k: old[k] if k in old and old[k].shape == a.shape else a for k, a in fresh.items()})
