@@ -199,8 +199,7 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
 
     unmoved = lambda: (state.plan, state.risk, state.recovery.visits, state.memory)  # noqa: E731
     plan, risk, visits, held = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
-    recover = state.recovery._replace(visits=visits)
-    return state._replace(belief=moved, plan=plan, risk=risk, memory=held, recovery=recover)
+    return state._replace(belief=moved, plan=plan, risk=risk, memory=held, recovery=state.recovery._replace(visits=visits))
 
 
 def _fine_clearance(spec: NavSpec, params: NavParams, held: FilterState) -> Float[Array, "n n"]:
@@ -239,13 +238,16 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
     remembered = state.memory
     retreating = recover.mode == behaviour.RETREAT
+    x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
+    here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
+    room = grids.flood_fill(local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here), here)
+    # a goal that is seen to be reachable settles it: a pocket that holds it is no dead end
+    shown = geometry.sample_nearest(GridMap(room, local.origin, grid.resolution), goal, fill=False)
+    risk = jnp.where(shown, 0.0, risk)
     if planner.recovery == "drnav":
-        x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
-        here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
-        room = local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here)
         points = recovery_points.observe(
-            spec.recovery_points, params.recovery_points, points, local, dead_end.probability(held.dead_end),
-            grids.flood_fill(room, here), state.time,
+            spec.recovery_points, params.recovery_points, points, local, dead_end.probability(held.dead_end), room,
+            state.time,
         )  # fmt: skip
         goal = jnp.where(retreating, recover.target, goal)
     found = None

@@ -45,6 +45,7 @@ class Config:
         groups: FAMILY+FAMILY@RANGE or FILE@RANGE.
         trips: Of each group.
         watched: Trips whose belief is looked at.
+        resolution: Edge of a pixel of floor plans [m].
         split: Of the families.
         weights: Of the fusion network; None = those that come with the package.
         seed: First seed of the worlds; of sampled trips and noise.
@@ -56,6 +57,7 @@ class Config:
     groups: tuple[str, ...] = GROUPS
     trips: int = 20
     watched: int = 6
+    resolution: float = 0.05
     split: str = "test"
     weights: Path | None = None
     seed: int = 100
@@ -98,7 +100,8 @@ def trips_of(config: Config, group: str) -> list[Trip]:
     setup = Setup(planner="grid", predictor="none")
     if Path(named).is_file():
         margin = evaluate.plan_margin(evaluate.NavParams())
-        source = sources.Source(map=Path(named), episodes=config.trips, seed=config.seed)
+        scale = None if named.endswith((".yaml", ".yml")) else config.resolution  # a map's own file says its scale
+        source = sources.Source(map=Path(named), resolution=scale, episodes=config.trips, seed=config.seed)
         return evaluate.prepare(sources.load(source, setup.robot_radius, setup.robot_radius + margin), setup)
     families = named.split("+")
     seeds = [(families[k % len(families)], config.seed + k // len(families)) for k in range(config.trips)]

@@ -98,6 +98,16 @@ def within_limits(command, twist):
     )
 
 
+@pytest.mark.parametrize("goal, hidden", [((1.6, -0.4), False), (GOAL, True), ((40.0, 0.0), True)])
+def test_a_goal_that_is_seen_to_be_reachable_lies_in_no_dead_end(trip, goal, hidden):
+    state = trip[10][0]
+    held = state.belief._replace(dead_end=jnp.full_like(state.belief.dead_end, 2.0))
+    seen = trip[10][1]._replace(goal=f32(goal))
+    after, _, _ = step(SPEC, PARAMS, state._replace(belief=held), seen, KEY, replan=True)
+    assert (float(after.risk.max()) > 0.5) == hidden and float(after.risk.min()) >= 0.0
+    assert float(after.belief.dead_end.max()) > 1.0, "what is believed stays"
+
+
 def test_it_drives_around_the_wall_to_the_goal_and_stops(trip):
     path = poses(trip)
     assert np.hypot(*(path[-1, :2] - GOAL)) <= PARAMS.goal_tolerance

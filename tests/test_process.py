@@ -1,9 +1,13 @@
 """What the command line sets for its process."""
 
+import signal
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+
+from drnav_jax.cli import process
 
 SCRIPT = """
 import resource, sys
@@ -27,3 +31,23 @@ def faults(mode):
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere the system's allocator is left alone")
 def test_memory_that_was_freed_is_not_faulted_in_again():
     assert faults("keep") < 100, "10 arrays of 8,192 pages"
+
+
+@pytest.fixture
+def sigterm():
+    before = signal.getsignal(signal.SIGTERM)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_sigterm_ends_as_ctrl_c_does(sigterm):
+    process.end_as_interrupted()
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGTERM)
+
+
+def test_a_thread_leaves_signals_alone(sigterm):
+    before = signal.getsignal(signal.SIGTERM)
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(process.end_as_interrupted).result()
+    assert signal.getsignal(signal.SIGTERM) is before

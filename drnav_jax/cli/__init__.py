@@ -48,6 +48,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = parse(argv)
         process.prepare()
+        process.end_as_interrupted()
         return _perform(args)
     except SystemExit:
         return 0

@@ -154,6 +154,7 @@ class Dataset:
         split: Of the worlds; families that are held out of training are in test only.
         seed: Of all that is drawn.
         families: Closed families, each gathered with its open twin.
+        litter: Share of the worlds in which legs of chairs and tables, posts and rough walls are added.
         out: Folder for the shards; the same command goes on where it was interrupted.
         workers: Shards made side by side.
         json: Print the manifest's counts as one JSON object on stdout, and nothing else there.
@@ -164,6 +165,7 @@ class Dataset:
     split: Literal["train", "val", "test"] = "train"
     seed: Annotated[int, _flag("N")] = 0
     families: Annotated[str | None, _flag("A,B,...", "default: all of the split")] = None
+    litter: Annotated[float, _flag("SHARE")] = 0.0
     workers: Annotated[int, _flag("N")] = 2
     json: bool = False
 
@@ -174,7 +176,7 @@ class Train:
 
     Attributes:
         out: Folder for checkpoints, logs and weights.
-        data: Folder of a training set (`drnav dataset`).
+        data: Folders of training sets (`drnav dataset`), drawn from as one.
         stream: Gather frames while training, in worlds without end.
         validation: Folder of a validation set (`drnav dataset --split val`).
         config: YAML or JSON file of settings (`train.TrainSpec`), such as `steps: 6000`.
@@ -184,7 +186,7 @@ class Train:
 
     out: Annotated[Path, _flag("DIR")]
     validation: Annotated[Path, _flag("DIR")]
-    data: Annotated[Path | None, _flag("DIR", "")] = None
+    data: Annotated[tuple[Path, ...], _flag("DIR", "")] = ()
     stream: bool = False
     config: Annotated[Path | None, _flag("FILE", "")] = None
     resume: bool = False

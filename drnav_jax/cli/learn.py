@@ -22,11 +22,10 @@ def _validation(args: Train) -> list[Batch]:
 
 def _about(args: Train) -> dict[str, dict[str, Any]]:
     """What the sets are, for the notes beside the weights."""
-    sets = {"train": args.data, "validation": args.validation}
-    manifests = {name: dataset.read_manifest(folder) for name, folder in sets.items() if folder is not None}
-    return {
-        name: {key: m["spec"][key] for key in ("split", "seed", "num_frames", "families")} for name, m in manifests.items()
-    }
+    folders = {f"train{k or ''}": folder for k, folder in enumerate(args.data)} | {"validation": args.validation}
+    told = ("split", "seed", "num_frames", "families", "litter")
+    specs = {name: dataset.read_manifest(folder)["spec"] for name, folder in folders.items()}
+    return {name: {key: spec[key] for key in told if key in spec} for name, spec in specs.items()}
 
 
 def perform(args: Train) -> int:
@@ -36,17 +35,16 @@ def perform(args: Train) -> int:
         ValueError: On a user's mistake.
         OSError: If a file cannot be read or written.
     """
-    if args.stream == (args.data is not None):
+    if args.stream == bool(args.data):
         raise ValueError("give either --data DIR or --stream.")
     spec = train.read(args.config)
     process.use_every_core()
     validation = _validation(args)
-    if args.data is not None:
-        folder = args.data
-        count = len(dataset.FrameSource(folder))  # mistakes come before --out is begun
+    if args.data:
+        count = len(dataset.FrameSource(*args.data))  # mistakes come before --out is begun
         if count < spec.batch_size:
-            raise ValueError(f"{folder} holds {count} frames: a batch has {spec.batch_size}.")
-        source = lambda first: dataset.batches(folder, spec.batch_size, spec.seed, first=first)  # noqa: E731
+            raise ValueError(f"{', '.join(map(str, args.data))} holds {count} frames: a batch has {spec.batch_size}.")
+        source = lambda first: dataset.batches(args.data, spec.batch_size, spec.seed, first=first)  # noqa: E731
     else:
         worlds = dataset.spec_of(1, "train", spec.seed)
         source = lambda first: dataset.stream(spec.batch_size, worlds, first=first)  # noqa: E731

@@ -3,7 +3,9 @@
 import contextlib
 import ctypes
 import os
+import signal
 import sys
+import threading
 from pathlib import Path
 
 import jax
@@ -17,6 +19,12 @@ def prepare() -> None:
     """What every process does first."""
     cache_programs()
     keep_memory()
+
+
+def end_as_interrupted() -> None:
+    """SIGTERM ends this process as Ctrl-C does, so that what is finished is kept and no worker is left behind."""
+    if threading.current_thread() is threading.main_thread():  # no other may say so
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def cache_programs() -> None:

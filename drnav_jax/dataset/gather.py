@@ -6,6 +6,7 @@ world), so that a shard is the same whatever was made before it.
 
 import dataclasses
 import math
+import zlib
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from drnav_jax.sim.lidar import LidarParams
 from drnav_jax.types import Mount, RigSpec, RobotParams, rig_of
 from drnav_jax.worlds import Scene, strata
 from drnav_jax.worlds.frames import frames
+from drnav_jax.worlds.litter import littered
 from drnav_jax.worlds.truth import GroundTruth, interior, truth
 
 ROWS = 64  # solids of a shard's worlds are padded to a multiple of this, so that shards share programs
@@ -29,11 +31,16 @@ SHORT = 0.35  # share of worlds whose LiDAR sees less far than 12 m
 OTHER = 500_000  # beyond the seeds of `pairs`: the second world of a family that has no twin
 
 
-def _pair(family: str, seed: int, split: str) -> tuple[Scene, Scene]:
-    """A closed world and its open twin; of a family without twins two worlds."""
+def _pair(data: DatasetSpec, family: str, seed: int) -> tuple[Scene, Scene]:
+    """A closed world and its open twin; of a family without twins two worlds. Some are littered."""
     opened = worlds.twin(family)
-    first = worlds.sample(family, seed, split)
-    return first, worlds.sample(opened or family, seed if opened else seed + OTHER, split)
+    first = worlds.sample(family, seed, data.split)
+    second = worlds.sample(opened or family, seed if opened else seed + OTHER, data.split)
+    rng = np.random.default_rng(np.random.SeedSequence([data.seed, seed, zlib.crc32(family.encode())]))
+    if rng.random() >= data.litter:
+        return first, second
+    a, b = littered([first, second], rng) if opened else (littered([scene], rng)[0] for scene in (first, second))
+    return a, b
 
 
 def _mount(mount: Mount, rng: np.random.Generator) -> Mount:
@@ -67,7 +74,7 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
         number: Of the shard.
     """
     chosen = pairs(data, number)
-    twins = [_pair(family, seed, data.split) for family, seed, _ in chosen]
+    twins = [_pair(data, family, seed) for family, seed, _ in chosen]
     truths = [(truth(a), truth(b)) for a, b in twins]
     twin_of = [worlds.twin(family) is not None for family, _, _ in chosen]
     scenes = [scene for pair in twins for scene in pair]

@@ -30,7 +30,9 @@ def families_of(split: str) -> tuple[str, ...]:
     return tuple(name for name in closed if split == "test" or name not in worlds.HELD_OUT)
 
 
-def spec_of(num_frames: int, split: str, seed: int, families: tuple[str, ...] | None = None) -> DatasetSpec:
+def spec_of(
+    num_frames: int, split: str, seed: int, families: tuple[str, ...] | None = None, litter: float = 0.0
+) -> DatasetSpec:
     """What to gather.
 
     Args:
@@ -38,12 +40,13 @@ def spec_of(num_frames: int, split: str, seed: int, families: tuple[str, ...] | 
         split: Of the worlds.
         seed: Of all that is drawn.
         families: Closed families; None = all of the split.
+        litter: Share of the worlds that are littered.
 
     Raises:
         ValueError: If a family is none of the split's, or a number is out of range.
     """
     known = families_of(split) if split in worlds.SPLITS else ()
-    spec = DatasetSpec(num_frames, split, seed, known if families is None else families)
+    spec = DatasetSpec(num_frames, split, seed, known if families is None else families, litter=litter)
     for name in spec.families:
         if name not in known:
             raise ValueError(f'"{name}" is no closed family of the split {split}: choose from {", ".join(known)}.')

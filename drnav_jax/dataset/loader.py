@@ -4,7 +4,7 @@ The order is a function of the seed: batch s of the stream is the same whether o
 training resumes. Frames are read straight out of the shards, which are never loaded whole.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,17 @@ from drnav_jax.dataset.shards import read_manifest
 
 
 class FrameSource:
-    """Frames of a dataset by number; opens a shard when it is first asked for one of its frames, in each process."""
+    """Frames of datasets by number; opens a shard when it is first asked for one of its frames, in each process."""
 
-    def __init__(self, folder: Path) -> None:
-        """Read the manifest.
+    def __init__(self, *folders: Path) -> None:
+        """Read the manifests.
 
         Raises:
-            ValueError: If the dataset is not complete.
+            ValueError: If a dataset is not complete.
         """
-        self.folder = folder
-        rows = read_manifest(folder)["shards"]
-        self.files = [row["file"] for row in rows]
-        self.ends = np.cumsum([row["frames"] for row in rows])
+        rows = [(folder / row["file"], row["frames"]) for folder in folders for row in read_manifest(folder)["shards"]]
+        self.files = [file for file, _ in rows]
+        self.ends = np.cumsum([count for _, count in rows])
         self._open: dict[int, Any] = {}
 
     def __len__(self) -> int:
@@ -40,7 +39,7 @@ class FrameSource:
         shard = int(np.searchsorted(self.ends, number, side="right"))
         row = number - (int(self.ends[shard - 1]) if shard else 0)
         if shard not in self._open:
-            self._open[shard] = safetensors.safe_open(self.folder / self.files[shard], framework="numpy")
+            self._open[shard] = safetensors.safe_open(self.files[shard], framework="numpy")
         held = self._open[shard]
         return Frame(*(np.asarray(held.get_slice(name)[row : row + 1])[0] for name in Frame._fields))
 
@@ -50,12 +49,13 @@ class FrameSource:
 
 
 def batches(
-    folder: Path, batch_size: int, seed: int, *, first: int = 0, epochs: int | None = None, workers: int = 1
-) -> Iterator[Frame]:
+    folders: Path | Sequence[Path], batch_size: int, seed: int, *, first: int = 0, epochs: int | None = None,
+    workers: int = 1,
+) -> Iterator[Frame]:  # fmt: skip
     """Shuffled batches `[B, ...]`, for ever or for some epochs.
 
     Args:
-        folder: A complete dataset.
+        folders: A complete dataset, or several as one.
         batch_size: B; what is left over at the end of an epoch goes into the next one.
         seed: Of the order.
         first: Number of the first batch: the stream goes on as if the ones before had been taken.
@@ -63,14 +63,14 @@ def batches(
         workers: Processes that read ahead; 0 reads in this one.
 
     Raises:
-        ValueError: If the dataset is not complete, or holds less than one batch.
+        ValueError: If a dataset is not complete, or all hold less than one batch.
     """
     import grain  # training only
     from absl import flags
 
-    source = FrameSource(folder)
+    source = FrameSource(folders) if isinstance(folders, Path) else FrameSource(*folders)
     if not 1 <= batch_size <= len(source):
-        raise ValueError(f"batch_size must lie within 1..{len(source)}, the frames of {folder}, got {batch_size}.")
+        raise ValueError(f"batch_size must lie within 1..{len(source)}, the frames of the dataset, got {batch_size}.")
     stream = grain.MapDataset.source(source).seed(seed).shuffle().repeat(epochs).batch(batch_size, drop_remainder=True)
     stream = stream[first:]
     reading = stream.to_iter_dataset(grain.ReadOptions(num_threads=0 if workers else 1, prefetch_buffer_size=1))

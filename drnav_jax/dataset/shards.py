@@ -39,6 +39,7 @@ class DatasetSpec:
         ticks: Ticks of 0.1 s from frame to frame.
         num_worlds: Worlds of a shard: pairs of twins, as many pairs to each behaviour.
         per_world: Frames of a world.
+        litter: Share of the pairs that are littered (`worlds.litter`).
     """
 
     num_frames: int
@@ -48,6 +49,7 @@ class DatasetSpec:
     ticks: int = 12
     num_worlds: int = 48
     per_world: int = 8
+    litter: float = 0.0
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -56,6 +58,8 @@ class DatasetSpec:
                 "num_frames, ticks and per_world must be >= 1 and seed >= 0, got "
                 f"{self.num_frames}, {self.ticks}, {self.per_world} and {self.seed}."
             )
+        if not 0 <= self.litter <= 1:
+            raise ValueError(f"litter is a share and must lie within 0..1, got {self.litter}.")
         if self.num_worlds < 1 or self.num_worlds % (2 * len(KINDS)):
             raise ValueError(f"num_worlds must be a multiple of {2 * len(KINDS)}, got {self.num_worlds}.")
         if self.split not in SPLITS:

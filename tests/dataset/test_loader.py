@@ -32,6 +32,20 @@ def test_frames_come_by_number(folder, make):
             np.testing.assert_array_equal(value, getattr(shard, name)[number % SHARD])
 
 
+def test_several_sets_are_one(folder, make, tmp_path):
+    spec = DatasetSpec(WORLDS, "train", 1, ("u", "t"), num_worlds=WORLDS, per_world=1)
+    shards.write(tmp_path, spec, {}, lambda _: cut(make(3)))
+    source = loader.FrameSource(folder, tmp_path)
+    assert len(source) == COUNT + WORLDS
+    assert source[COUNT].seed == make(3).seed[0] and source[COUNT - 1].seed == make(1).seed[COUNT - 1 - SHARD]
+    got = seeds(loader.batches([folder, tmp_path], 11, 0, epochs=1, workers=0), 1000)
+    assert set(sum(got, [])) & set(make(3).seed[:WORLDS].tolist())
+
+
+def cut(frames):
+    return Frame(*(np.asarray(field)[:WORLDS] for field in frames))
+
+
 def test_an_epoch_is_every_frame_once(folder):
     got = seeds(loader.batches(folder, 13, 5, epochs=1, workers=0), 1000)
     flat = sum(got, [])
