@@ -66,7 +66,7 @@ def forget_programs():
     """Drops compiled programs once they hold many memory mappings, of which Linux grants a process 65,530."""
     yield
     maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > 20_000:
+    if not maps.exists() or maps.read_bytes().count(b"\n") > 40_000:
         jax.clear_caches()
 
 

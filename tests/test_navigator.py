@@ -307,7 +307,7 @@ def compare_batch(record, replan):
             np.testing.assert_allclose(a, b, atol=SAME, rtol=SAME)
 
 
-@pytest.mark.parametrize("replan", [True, False])
+@pytest.mark.parametrize("replan", [pytest.param(True, marks=pytest.mark.long), False])
 def test_a_batch_equals_single_calls(trip, replan):
     compare_batch(trip[::8][:16], replan)
 
@@ -345,6 +345,7 @@ def test_followers_of_a_route_drive_around_the_wall(planner):
     assert min(float(clearance(WORLD, f32(p[:2]))) for p in path) > ROBOT.radius
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("planner", ["mppi", "nav2-dwb"])
 def test_broken_sensors_give_followers_no_broken_command_either(trip, planner):
     spec = dataclasses.replace(SPEC, planner=PLANNERS[planner], follower=FOLLOWER)

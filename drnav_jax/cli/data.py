@@ -38,7 +38,7 @@ def gather(args: Dataset) -> int:
         OSError: If a file cannot be written.
     """
     families = None if args.families is None else tuple(name.strip() for name in args.families.split(","))
-    spec = dataset.spec_of(args.frames, args.split, args.seed, families, args.litter)
+    spec = dataset.spec_of(args.frames, args.split, args.seed, families, args.litter, args.charted)
     bar = Bar("dataset", args.frames, "frames")
     try:
         with stdout_kept(args.json):

@@ -155,6 +155,7 @@ class Dataset:
         seed: Of all that is drawn.
         families: Closed families, each gathered with its open twin.
         litter: Share of the worlds in which legs of chairs and tables, posts and rough walls are added.
+        charted: Share that are sensed as occupancy grids are, as every map is.
         out: Folder for the shards; the same command goes on where it was interrupted.
         workers: Shards made side by side.
         json: Print the manifest's counts as one JSON object on stdout, and nothing else there.
@@ -166,6 +167,7 @@ class Dataset:
     seed: Annotated[int, _flag("N")] = 0
     families: Annotated[str | None, _flag("A,B,...", "default: all of the split")] = None
     litter: Annotated[float, _flag("SHARE")] = 0.0
+    charted: Annotated[float, _flag("SHARE")] = 0.0
     workers: Annotated[int, _flag("N")] = 2
     json: bool = False
 

@@ -23,7 +23,7 @@ def _validation(args: Train) -> list[Batch]:
 def _about(args: Train) -> dict[str, dict[str, Any]]:
     """What the sets are, for the notes beside the weights."""
     folders = {f"train{k or ''}": folder for k, folder in enumerate(args.data)} | {"validation": args.validation}
-    told = ("split", "seed", "num_frames", "families", "litter")
+    told = ("split", "seed", "num_frames", "families", "litter", "charted")
     specs = {name: dataset.read_manifest(folder)["spec"] for name, folder in folders.items()}
     return {name: {key: spec[key] for key in told if key in spec} for name, spec in specs.items()}
 

@@ -21,26 +21,30 @@ from drnav_jax.dataset.shards import DatasetSpec, pairs
 from drnav_jax.sim import CameraParams, mjx
 from drnav_jax.sim.lidar import LidarParams
 from drnav_jax.types import Mount, RigSpec, RobotParams, rig_of
-from drnav_jax.worlds import Scene, strata
+from drnav_jax.worlds import Scene, World, strata
 from drnav_jax.worlds.frames import frames
-from drnav_jax.worlds.litter import littered
+from drnav_jax.worlds.litter import charted, littered
 from drnav_jax.worlds.truth import GroundTruth, interior, truth
 
 ROWS = 64  # solids of a shard's worlds are padded to a multiple of this, so that shards share programs
+CHARTS = (256, 384, 512, 1024)  # cells along an edge that grids are padded to
 SHORT = 0.35  # share of worlds whose LiDAR sees less far than 12 m
 OTHER = 500_000  # beyond the seeds of `pairs`: the second world of a family that has no twin
 
 
-def _pair(data: DatasetSpec, family: str, seed: int) -> tuple[Scene, Scene]:
-    """A closed world and its open twin; of a family without twins two worlds. Some are littered."""
+def _pair(data: DatasetSpec, family: str, seed: int) -> tuple[list[Scene], list[Scene]]:
+    """A closed world and its open twin (of a family without twins two worlds), as driven in and as sensed."""
     opened = worlds.twin(family)
-    first = worlds.sample(family, seed, data.split)
-    second = worlds.sample(opened or family, seed if opened else seed + OTHER, data.split)
+    plain = [worlds.sample(family, seed, data.split)]
+    plain.append(worlds.sample(opened or family, seed if opened else seed + OTHER, data.split))
     rng = np.random.default_rng(np.random.SeedSequence([data.seed, seed, zlib.crc32(family.encode())]))
-    if rng.random() >= data.litter:
-        return first, second
-    a, b = littered([first, second], rng) if opened else (littered([scene], rng)[0] for scene in (first, second))
-    return a, b
+    share = rng.random()
+    groups = [plain] if opened else [[scene] for scene in plain]
+    if share < data.charted:
+        return plain, [scene for group in groups for scene in charted(group, rng)]
+    if share < data.charted + data.litter:
+        plain = [scene for group in groups for scene in littered(group, rng)]
+    return plain, plain
 
 
 def _mount(mount: Mount, rng: np.random.Generator) -> Mount:
@@ -74,10 +78,12 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
         number: Of the shard.
     """
     chosen = pairs(data, number)
-    twins = [_pair(data, family, seed) for family, seed, _ in chosen]
+    made = [_pair(data, family, seed) for family, seed, _ in chosen]
+    twins = [sensed for _, sensed in made]
     truths = [(truth(a), truth(b)) for a, b in twins]
     twin_of = [worlds.twin(family) is not None for family, _, _ in chosen]
     scenes = [scene for pair in twins for scene in pair]
+    roads = [scene for driven, _ in made for scene in driven]
     rngs = [np.random.default_rng(np.random.SeedSequence([data.seed, number, k])) for k in range(data.num_worlds)]
 
     plans = []
@@ -90,14 +96,15 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
     drive_key, load_key, sense_key = jax.random.split(key, 3)
     bodies = jax.vmap(lambda k: mjx.uniform(k, *collect.BODIES))(jax.random.split(load_key, data.num_worlds))
     faults = jax.vmap(lambda k: mjx.uniform(k, *collect.FAULTS))(jax.random.split(load_key, data.num_worlds))
-    stacked = worlds.stack_worlds([scene.world for scene in scenes], multiple_of=ROWS)
+    stacked = worlds.stack_worlds([scene.world for scene in roads], multiple_of=ROWS)
     poses = collect.drive(
-        data.per_world * data.ticks, KINDS, RobotParams(), stacked, mjx.solids_of([scene.world for scene in scenes]),
+        data.per_world * data.ticks, KINDS, RobotParams(), stacked, mjx.solids_of([scene.world for scene in roads]),
         jax.tree.map(lambda *a: np.stack(a), *plans), bodies, faults, drive_key,
     )  # fmt: skip
     parts = []
     for k, scene in enumerate(scenes):
-        world = jax.tree.map(lambda a, k=k: a[k], stacked)
+        chart = _padded(scene.world) if scene.world.field.values.size else None
+        world = jax.tree.map(lambda a, k=k: a[k], stacked) if chart is None else chart
         sensed = collect.sense(
             spec, data.ticks, world, _sensors(spec, rngs[k]), poses[k], jax.random.fold_in(sense_key, k)
         )
@@ -113,6 +120,14 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
         about["strata_seen"] = seen @ np.array(list(STRATUM_BITS.values()))
         parts.append(_joined(spec, jax.device_get(sensed), truths[k // 2][k % 2], inner, about))
     return Frame(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def _padded(world: World) -> World:
+    """A grid's world on one of few sizes, so that worlds share programs."""
+    h, w = world.field.values.shape
+    size = min((n for n in CHARTS if n >= max(h, w)), default=max(h, w))
+    values = np.pad(world.field.values, ((0, size - h), (0, size - w)), mode="edge")
+    return world._replace(field=world.field._replace(values=values))
 
 
 def _joined(

@@ -31,8 +31,9 @@ def families_of(split: str) -> tuple[str, ...]:
 
 
 def spec_of(
-    num_frames: int, split: str, seed: int, families: tuple[str, ...] | None = None, litter: float = 0.0
-) -> DatasetSpec:
+    num_frames: int, split: str, seed: int, families: tuple[str, ...] | None = None, litter: float = 0.0,
+    charted: float = 0.0,
+) -> DatasetSpec:  # fmt: skip
     """What to gather.
 
     Args:
@@ -41,12 +42,13 @@ def spec_of(
         seed: Of all that is drawn.
         families: Closed families; None = all of the split.
         litter: Share of the worlds that are littered.
+        charted: Share that are sensed as occupancy grids.
 
     Raises:
         ValueError: If a family is none of the split's, or a number is out of range.
     """
     known = families_of(split) if split in worlds.SPLITS else ()
-    spec = DatasetSpec(num_frames, split, seed, known if families is None else families, litter=litter)
+    spec = DatasetSpec(num_frames, split, seed, known if families is None else families, litter=litter, charted=charted)
     for name in spec.families:
         if name not in known:
             raise ValueError(f'"{name}" is no closed family of the split {split}: choose from {", ".join(known)}.')

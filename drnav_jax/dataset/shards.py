@@ -40,6 +40,7 @@ class DatasetSpec:
         num_worlds: Worlds of a shard: pairs of twins, as many pairs to each behaviour.
         per_world: Frames of a world.
         litter: Share of the pairs that are littered (`worlds.litter`).
+        charted: Share that are sensed as occupancy grids, littered too.
     """
 
     num_frames: int
@@ -50,6 +51,7 @@ class DatasetSpec:
     num_worlds: int = 48
     per_world: int = 8
     litter: float = 0.0
+    charted: float = 0.0
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -58,8 +60,8 @@ class DatasetSpec:
                 "num_frames, ticks and per_world must be >= 1 and seed >= 0, got "
                 f"{self.num_frames}, {self.ticks}, {self.per_world} and {self.seed}."
             )
-        if not 0 <= self.litter <= 1:
-            raise ValueError(f"litter is a share and must lie within 0..1, got {self.litter}.")
+        if min(self.litter, self.charted) < 0 or not self.litter + self.charted <= 1:
+            raise ValueError(f"litter and charted are shares of at most 1 together, got {self.litter} and {self.charted}.")
         if self.num_worlds < 1 or self.num_worlds % (2 * len(KINDS)):
             raise ValueError(f"num_worlds must be a multiple of {2 * len(KINDS)}, got {self.num_worlds}.")
         if self.split not in SPLITS:

@@ -7,9 +7,6 @@ cell's answer weighs:
     (2)  w = 1 where a sensor has seen the cell free, `unseen` where it has not but has seen one within `NEAR`, else 0
     (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
 
-What is said is p = σ(logit p̂ + `lean`): the network's p̂ is calibrated, but a pocket that is not foreseen costs more than a
-way that is doubted for a while.
-
 `weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper). And since
 the network reads the map that earlier frames made, what it says `repeats` most of what it said (`filter.dead_end`, eq. 7).
 
@@ -52,7 +49,6 @@ class FusionParams(NamedTuple):
     calibration: Calibration = Calibration()
     weight: Scalar = 0.35  # [] of one frame's answer
     repeats: Scalar = 1.0  # [] share of earlier answers that an answer stands for
-    lean: Scalar = 0.0  # [nat] towards dead ends
     unseen: Scalar = 0.6  # [] w of eq. 2
     still: Scalar = 0.1  # [] m of eq. 3 of a robot that stands
     moving: Scalar = 0.2  # [] speed [m/s] and rate [rad/s] from which m = 1
@@ -158,7 +154,7 @@ def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMa
         out = answer(spec, params, observation, local_map)
         known = bev.classes(spec.bev, local_map, observation.pose)
         sound = jnp.isfinite(out.dead)
-        p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead + params.lean), 0.5)
+        p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
         confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
         barred = blocked(spec, params, observation, known, out.traversable)
         found = evidence(spec, observation.pose, p_dead, confidence, barred, local_map)

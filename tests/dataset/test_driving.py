@@ -112,6 +112,7 @@ def test_they_keep_off_the_walls(kind):
             assert room.min() > 0.25 - 0.02  # physics keeps them out
 
 
+@pytest.mark.long
 def test_the_same_key_is_the_same_drive_and_worlds_do_not_mind_each_other():
     scenes, plans = everything()
     np.testing.assert_array_equal(drive(scenes, plans, 0), all_poses())

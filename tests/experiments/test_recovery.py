@@ -76,6 +76,9 @@ def test_rows_name_planner_and_recovery():
     assert recovery.setup_of(Config(), "drnav").recovery is None
 
 
-def test_too_few_trips_are_an_error(tmp_path):
+def test_too_few_trips_are_an_error(tmp_path, monkeypatch):
+    tried = []
+    monkeypatch.setattr(recovery, "trapped", lambda config, family, seed, cache: tried.append((family, seed)))
     with pytest.raises(ValueError, match="0 of 1 trips"):
-        recovery.gathered(Config(trips=1, families=("u",), least=90.0, most=91.0, out=tmp_path))
+        recovery.gathered(Config(trips=1, families=("u", "t"), out=tmp_path))
+    assert len(tried) == len(set(tried)) == 50 and tried[:3] == [("u", 0), ("t", 0), ("u", 1)]

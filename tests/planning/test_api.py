@@ -35,6 +35,7 @@ def optimum(place, effort, steps):
     return v, float(np.sum((reach @ v - place) ** 2) + effort * np.sum(v**2))
 
 
+@pytest.mark.long
 def test_a_quadratic_price_is_driven_to_its_optimum():
     steps, place, effort = 12, 1.0, 0.05
     best, least = optimum(place, effort, steps)

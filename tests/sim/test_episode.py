@@ -177,7 +177,12 @@ def outcome(result):
     return s.success, s.collision, s.tick, result.finished
 
 
-@pytest.mark.parametrize(("lanes", "workers"), [(1, 7), (2, 1), (8, 2)])
+LONG = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("lanes", "workers"), [(1, 7), pytest.param(2, 1, marks=LONG), pytest.param(8, 2, marks=LONG)]
+)
 def test_neither_lanes_nor_workers_change_a_result(params, result, lanes, workers):
     spec = EpisodeSpec(lidar=SPEC.lidar, chunk_ticks=10, replan_every=5, lanes=lanes)
     other = episode.run(spec, POLICY, params, keys(5), workers=workers)
@@ -190,6 +195,7 @@ def test_neither_lanes_nor_workers_change_a_result(params, result, lanes, worker
         np.testing.assert_array_equal(other.log.policy["steps"][k, :n], result.log.policy["steps"][k, :n])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("chunk", "every"), [(20, 2)])
 def test_nor_do_chunks(params, result, chunk, every):
     spec = EpisodeSpec(lidar=SPEC.lidar, chunk_ticks=chunk, replan_every=every)

@@ -241,7 +241,7 @@ def crowd(num):
 TICKS = 100
 
 
-@pytest.mark.parametrize("num", [64, pytest.param(256, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num", [pytest.param(64, marks=pytest.mark.long), pytest.param(256, marks=pytest.mark.slow)])
 def test_contact_stops_it_in_random_worlds(num):
     every, solids, poses, bodies = crowd(num)
     (path, log), _ = drive_many(solids, poses, bodies, jax.random.key(0), TICKS)

@@ -116,6 +116,7 @@ def test_a_finished_run_may_be_resumed_and_changes_nothing(whole, validation):
     assert weights.load(whole[0] / "weights.safetensors").sha256 == before and result.step == whole[1].step
 
 
+@pytest.mark.long
 def test_it_goes_on_from_weights(validation, tmp_path, whole):
     """They are where it begins; a rate of almost nothing leaves them as they are."""
     file = whole[0] / "weights.safetensors"
@@ -179,6 +180,7 @@ def test_no_checkpoint_at_all(tmp_path):
     kept.close()
 
 
+@pytest.mark.long
 def test_validation_without_both_kinds_still_ends_in_weights(validation, tmp_path):
     """Frames none of which is a dead end: that head keeps its raw logits, and hours of training are not lost."""
     open_ = [b._replace(targets=b.targets._replace(dead_end_flag=np.zeros(8, bool))) for b in validation]

@@ -46,6 +46,7 @@ def step():
     network.apply = before
 
 
+@pytest.mark.long
 def test_steps_lower_the_loss_and_the_average_follows(step):
     state, frames, said = begun(), trimmed(batch(4)), []
     history = [host(state.params)]

@@ -34,6 +34,23 @@ def test_litter_is_the_same_in_twins_and_stands_in_nobodys_way(family):
         assert worlds.check_trip(scene, litter.BODY)[0] == pytest.approx(worlds.check_trip(old, litter.BODY)[0], abs=0.3)
 
 
+@pytest.mark.parametrize("family", ["t", "glass"])
+def test_charted_worlds_are_grids_that_differ_where_the_twins_do(family):
+    before = twins(family)
+    after = litter.charted(before, np.random.default_rng(5))
+    for scene, old in zip(after, before, strict=True):
+        assert len(scene.world.boxes) == len(scene.world.cylinders) == 0 and scene.strata == ()
+        assert (scene.occupied >= old.occupied).all() and scene.occupied.sum() > old.occupied.sum()
+        x, y = (scene.origin[k] + (np.arange(scene.occupied.shape[1 - k]) + 0.5) * scene.resolution for k in (0, 1))
+        centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        apart = signed_distance(scene.world, centres)
+        assert apart[scene.occupied.ravel()].max() < 0.01 and apart[~scene.occupied.ravel()].min() > -0.01
+        way = worlds.check_trip(old, litter.BODY)
+        assert worlds.check_trip(scene, litter.BODY)[0] == pytest.approx(way[0], abs=0.3)
+    closed, opened = (scene.occupied for scene in after)
+    assert ((closed != opened) <= (before[0].occupied != before[1].occupied)).all() and (closed != opened).any()
+
+
 def test_it_follows_the_generator_and_most_of_it_is_new_each_time():
     draw = lambda seed: litter.littered(twins("u"), np.random.default_rng(seed))[0].world.cylinders  # noqa: E731
     np.testing.assert_array_equal(draw(1), draw(1))
