@@ -33,7 +33,10 @@ OTHER = 500_000  # beyond the seeds of `pairs`: the second world of a family tha
 
 
 def _pair(data: DatasetSpec, family: str, seed: int) -> tuple[list[Scene], list[Scene]]:
-    """A closed world and its open twin (of a family without twins two worlds), as driven in and as sensed."""
+    """A closed world and its open twin (of a family without twins two worlds), as driven in and as sensed.
+
+    Grids are driven in as the solids that they were made from: few added cells stand where a robot comes by.
+    """
     opened = worlds.twin(family)
     plain = [worlds.sample(family, seed, data.split)]
     plain.append(worlds.sample(opened or family, seed if opened else seed + OTHER, data.split))

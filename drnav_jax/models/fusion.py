@@ -16,9 +16,9 @@ no return in it or beside it, may be a pane of glass, and one that it holds to b
     (4)  blocked(c) = m [`pane` - logit t(c)], kept within -`clears`..`closes`     where LiDAR holds c to be free
          blocked(c) = -m logit t(c), kept within -`opens`..`opens`                 where it holds c to be occupied
 
-and 0 elsewhere. Of a pane t is rarely below a half, of floor it is nearly always far above: so `pane` lies above 0 nat (the
-model card has both distributions). Floor doubted in one frame is many times as frequent as a pane, so only doubt that
-lasts for some frames closes a cell.
+and 0 elsewhere. Of a pane t is rarely below a half, of floor it is nearly always far above: so `pane` lies above 0 nat. But
+in real buildings floor beside thin things is doubted as much, and ways that lead nowhere else were closed; so `closes` is 0
+unless one knows the place (the model card has the figures).
 """
 
 import functools
