@@ -48,7 +48,7 @@ def test_the_commands_are_commands():
         kinds.append(type(args))
         if isinstance(args, cli.Run | cli.Compare):
             assert drive.setups_of(args) and drive.scenes_of(args)
-    assert kinds == [cli.Run, cli.Compare, cli.Dataset, cli.Dataset, cli.Train, cli.Compare]
+    assert kinds == [cli.Run, cli.Compare, *[cli.Dataset] * 3, cli.Train, cli.Compare]
     targets = {words[1] for words in lines if words and words[0] == "make"}
     assert targets == {"demo", "test"}
 
