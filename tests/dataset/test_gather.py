@@ -20,7 +20,7 @@ from drnav_jax.worlds.frames import NEVER, NOW
 
 pytestmark = pytest.mark.long
 SPEC = FrameSpec(rig=RigSpec(FRONT_LEFT_RIGHT[:2], (12, 16)), lidar=LidarSpec(4, 180), bev=BevSpec((24, 32)))
-DATA = DatasetSpec(48, "train", 0, ("u", "t"), ticks=5, num_worlds=8, per_world=6, litter=0.5)
+DATA = DatasetSpec(48, "train", 0, ("u", "t"), ticks=5, num_worlds=8, per_world=6)
 
 
 @pytest.fixture(scope="module")
