@@ -8,6 +8,7 @@ never seen such walls all of a real building is doubtful. Twins get the same lit
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -15,7 +16,7 @@ from scipy import ndimage
 from drnav_jax.worlds.dressing import COLOURS
 from drnav_jax.worlds.materials import Material
 from drnav_jax.worlds.trips import check_trip
-from drnav_jax.worlds.world import Scene, Surfaces, from_grid, rasterise
+from drnav_jax.worlds.world import Scene, Surfaces, from_grid, rasterise, surfaces
 
 CELL = 0.1  # [m] of the families' grids
 THINGS = (6, 24)  # tried in a world
@@ -32,6 +33,11 @@ REACH = 6.0  # [m] from its ways within which there is litter
 MATERIALS = (Material.WOOD, Material.METAL, Material.WALL, Material.CONCRETE)
 
 
+def _grown(mask: np.ndarray) -> np.ndarray:
+    """True cells and those beside them."""
+    return np.asarray(ndimage.binary_dilation(mask), bool)
+
+
 def _legs(rng: np.random.Generator) -> np.ndarray:
     """Pieces of one thing `[N, 2]` [m]: a chair, a table, or posts in a row."""
     kind, n = rng.integers(3), rng.integers(2, 7)
@@ -44,7 +50,7 @@ def _legs(rng: np.random.Generator) -> np.ndarray:
 def _things(occupied: np.ndarray, near_ways: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
     """Pieces of things in free places `[N, 2]`, x and y in cells."""
     free = ~occupied & near_ways
-    free, beside = np.argwhere(free), np.argwhere(free & ndimage.binary_dilation(occupied))
+    free, beside = np.argwhere(free), np.argwhere(free & _grown(occupied))
     found = []
     for _ in range(rng.integers(*THINGS) if len(free) else 0):
         if len(beside) and rng.random() < ALONG_WALLS:
@@ -62,14 +68,15 @@ def _things(occupied: np.ndarray, near_ways: np.ndarray, rng: np.random.Generato
 def _apart(twins: Sequence[Scene]) -> np.ndarray:
     """Distance `[H, W]` [m] of cells to the shortest ways."""
     first = twins[0]
-    away = np.ones(first.occupied.shape, bool)
+    h, w = first.occupied.shape
+    away = np.ones((h, w), bool)
     for scene in twins:
         way = check_trip(scene, BODY)[1]
         length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
         at = np.arange(0.0, length[-1], first.resolution / 2)
         along = np.stack([np.interp(at, length, way[:, k]) for k in (1, 0)], axis=-1)
         i, j = np.floor((along - np.asarray(first.origin)[::-1]) / first.resolution).astype(int).T
-        inside = (i >= 0) & (i < away.shape[0]) & (j >= 0) & (j < away.shape[1])
+        inside = (i >= 0) & (i < h) & (j >= 0) & (j < w)
         away[i[inside], j[inside]] = False
     return np.asarray(ndimage.distance_transform_edt(away)) * first.resolution
 
@@ -118,7 +125,7 @@ def charted(twins: Sequence[Scene], rng: np.random.Generator) -> list[Scene]:
     """
     apart = _apart(twins)
     added = (apart > FREE) & (rng.random(apart.shape) < rng.uniform(0.0, ROUGH))
-    added &= ndimage.binary_dilation(np.all([scene.occupied for scene in twins], axis=0))
+    added &= _grown(np.all([scene.occupied for scene in twins], axis=0))
     for cells in _pieces(twins, apart, rng):
         j, i = np.floor(cells).astype(int).T
         added[i, j] = True
@@ -133,15 +140,17 @@ def _drawn(scene: Scene, occupied: np.ndarray, plain: bool) -> Scene:
     return replace(scene, world=world, occupied=occupied, strata=())
 
 
+def _joined(a: Any, b: Any) -> Any:
+    """Rows after rows."""
+    return np.concatenate([a, b])
+
+
 def _with(scene: Scene, rows: list[list[float]], materials: list[Material], colours: list[tuple]) -> Scene:
     """The scene and some cylinders."""
     world = scene.world
-    held = world.cylinder_surfaces
+    added = surfaces(len(rows), materials, colours)
     world = world._replace(
         cylinders=np.concatenate([world.cylinders, np.asarray(rows, np.float32)]),
-        cylinder_surfaces=Surfaces(
-            np.concatenate([held.material, np.asarray(materials, np.int32)]),
-            np.concatenate([held.colour, np.asarray(colours, np.float32)]),
-        ),
+        cylinder_surfaces=Surfaces(*map(_joined, world.cylinder_surfaces, added)),
     )
     return replace(scene, world=world, occupied=rasterise(world, scene.origin, scene.occupied.shape, scene.resolution))
