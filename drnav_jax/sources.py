@@ -109,11 +109,16 @@ def load(source: Source, radius: float, clearance: float) -> list[Scene]:
     return found or worlds.sample_trips(scene, source.episodes, source.seed, clearance, MIN_TRIP)
 
 
+def states_scale(file: Path) -> bool:
+    """Whether a map's file says how large a cell is: map_server's does, an image does not."""
+    return file.suffix.lower() in (".yaml", ".yml")
+
+
 def _map_scene(source: Source) -> Scene:
     if source.movingai is not None:
         return worlds.load_moving_ai(source.movingai, CELL if source.resolution is None else source.resolution)
     assert source.map is not None
-    if source.map.suffix.lower() in (".yaml", ".yml"):
+    if states_scale(source.map):
         if source.resolution is not None:
             raise ValueError(f"{source.map} states its own resolution: leave out --resolution.")
         return worlds.load_map_server(source.map)

@@ -100,7 +100,7 @@ def trips_of(config: Config, group: str) -> list[Trip]:
     setup = Setup(planner="grid", predictor="none")
     if Path(named).is_file():
         margin = evaluate.plan_margin(evaluate.NavParams())
-        scale = None if named.endswith((".yaml", ".yml")) else config.resolution  # a map's own file says its scale
+        scale = None if sources.states_scale(Path(named)) else config.resolution
         source = sources.Source(map=Path(named), resolution=scale, episodes=config.trips, seed=config.seed)
         return evaluate.prepare(sources.load(source, setup.robot_radius, setup.robot_radius + margin), setup)
     families = named.split("+")

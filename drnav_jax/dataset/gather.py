@@ -106,8 +106,8 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
     )  # fmt: skip
     parts = []
     for k, scene in enumerate(scenes):
-        chart = _padded(scene.world) if scene.world.field.values.size else None
-        world = jax.tree.map(lambda a, k=k: a[k], stacked) if chart is None else chart
+        chart = scene.world.field.values.size > 0
+        world = _padded(scene.world) if chart else jax.tree.map(lambda a, k=k: a[k], stacked)
         sensed = collect.sense(
             spec, data.ticks, world, _sensors(spec, rngs[k]), poses[k], jax.random.fold_in(sense_key, k)
         )
