@@ -247,9 +247,12 @@ def params_of(setup: Setup) -> NavParams:
     predictor: Any = {"geometric": rule}.get(setup.evidence)
     if setup.evidence == "fusion":
         predictor = fusion.params_of(trained(setup.weights), rule=rule)
+    belief = params.filter.dead_end
+    if setup.evidence == "oracle":  # its labels are those of the trip
+        belief = belief._replace(extent=0.0)
     return params._replace(
         robot=robot, score=score, route=route, predictor=predictor,
-        filter=params.filter._replace(occupancy=occupancy),
+        filter=params.filter._replace(occupancy=occupancy, dead_end=belief),
     )  # fmt: skip
 
 

@@ -241,9 +241,9 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
     here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
     room = grids.flood_fill(local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here), here)
-    if planner.predicts:  # a goal that is seen to be reachable settles it: a pocket that holds it is no dead end
+    if planner.predicts:
         shown = geometry.sample_nearest(GridMap(room, local.origin, grid.resolution), goal, fill=False)
-        risk = jnp.where(shown, 0.0, risk)
+        risk = dead_end.on_trip(params.filter.dead_end, risk, jnp.hypot(x - goal[0], y - goal[1]), shown)
     if planner.recovery == "drnav":
         points = recovery_points.observe(
             spec.recovery_points, params.recovery_points, points, local, dead_end.probability(held.dead_end), room,

@@ -161,6 +161,7 @@ def test_compare_writes_the_same_bytes_again(capsys):
     assert set(os.listdir("b")) == {"summary.json", "timing.json"}
 
 
+@pytest.mark.long
 def test_run_prints_a_table_and_cleans_up_after_itself(capsys, monkeypatch):
     def missing(*_, **__):
         raise MissingExtra
@@ -260,7 +261,10 @@ def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, mon
 
 @pytest.mark.parametrize(
     ("flags", "message"),
-    [((), "no weights of the fusion network (train some"), (("--no-cameras",), "the robot has no cameras")],
+    [
+        pytest.param((), "no weights of the fusion network (train some", marks=pytest.mark.long),
+        (("--no-cameras",), "the robot has no cameras"),
+    ],
 )
 def test_the_rule_stands_in_for_the_network(capsys, flags, message):
     short = ("run", "--world", "u:0", "--time-limit", "1", "--no-pictures", "--json")

@@ -87,6 +87,7 @@ def test_labels_on_a_finer_map_come_on_their_own_grid():
     assert value(labels, scene.start[:2]) == value(labels, scene.goal) == 0
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupt_keeps_what_is_finished():
     trips = evaluate.prepare([worlds.sample("u", k) for k in (0, 1)], evaluate.Setup())

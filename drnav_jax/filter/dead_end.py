@@ -11,13 +11,19 @@ are not independent. Before (5) the belief may forget: l <- l_0 + (l - l_0) exp(
 A predictor that reads the accumulated map says in each frame what it has said before, so a lasting doubt of p^ = 0.3 would
 add up to certainty. Of such evidence, which repeats a share r of what came before it, only the rest of the belief is kept:
 
-    l <- l_0 + (l - l_0) (1 - r w)                                                             (7)
+    l <- l_0 + (l - l_0) (1 - r w)                                                            (6a)
 
 With r = 1 the belief tends to p^ itself, by the share w in each frame.
 
 Risk is what lies above the prior, (P - p_0) / (1 - p_0) and never below 0, so cells without
-evidence add none. P^foot is the mean of P (or of the risk) over the cells that the robot covers,
-weighted by the covered share of each.
+evidence add none. A dead end that holds the goal is none on this trip, and the nearer a cell is to the
+goal, the likelier. With d the distance from the goal (on the floors of real buildings the share of the
+dead-end cells that are dead ends on a trip, too, grows from none at the goal to most within 1 to 6 m),
+
+    risk on the trip = risk (1 - exp(-(d / extent)^2)),  0 once a known way leads to the goal (6b)
+
+P^foot is the mean of P (or of the risk) over the cells that the robot covers, weighted by the covered
+share of each.
 """
 
 from functools import partial
@@ -41,6 +47,7 @@ class DeadEndParams(NamedTuple):
     l_max: Scalar = 6.0  # [] saturation, dead end [nat]
     forgetting: Scalar = 0.0  # [] rate of decay toward the prior [1/s]
     gain: Scalar = 1.0  # [] weight of one frame's evidence
+    extent: Scalar = 3.0  # [] a dead end so near the goal may well hold it, eq. 6b [m]
 
 
 def log_odds(probability: Scalar) -> Array:
@@ -64,6 +71,21 @@ def risk(params: DeadEndParams, log_odds: Float[Array, "*s"]) -> Float[Array, "*
     p0 = params.prior
     # At the prior itself sigmoid(logit(p0)) may round to just above p0.
     return jnp.maximum((probability(log_odds) - p0) / (1 - p0) - 1e-6, 0.0)
+
+
+def on_trip(
+    params: DeadEndParams, risk: Float[Array, "*s"], to_goal: Float[Array, "*s"], shown: Bool[Array, ""]
+) -> Float[Array, "*s"]:
+    """Risk for a robot that is on its way to a goal (eq. 6b).
+
+    Args:
+        params: Whose `extent` counts; 0 = the risk is of this trip already.
+        risk: Of being in a dead end, whatever the goal.
+        to_goal: Distance of each cell from the goal [m].
+        shown: Whether a known way leads to the goal: no dead end is in the way then.
+    """
+    apart = -jnp.expm1(-jnp.square(to_goal / jnp.maximum(params.extent, 1e-6)))
+    return jnp.where(shown, 0.0, risk * apart)
 
 
 @jax.jit

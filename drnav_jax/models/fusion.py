@@ -8,7 +8,7 @@ cell's answer weighs:
     (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
 
 `weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper). And since
-the network reads the map that earlier frames made, what it says `repeats` most of what it said (`filter.dead_end`, eq. 7).
+the network reads the map that earlier frames made, what it says `repeats` most of what it said (`filter.dead_end`, eq. 6a).
 
 What it says of traversability, t, corrects the LiDAR's map where the two differ: a cell that LiDAR holds to be free, with
 no return in it or beside it, may be a pane of glass, and one that it holds to be occupied may be grass. Within `sight`

@@ -29,6 +29,7 @@ def recorded():
     return drive.record(drive.STRIDE)
 
 
+@pytest.mark.long
 def test_memory_of_the_scoring_kernel_is_flat_in_candidates(recorded):
     words = growth._field(recorded)
     used = [growth._scores(recorded, words, num, 8)[1] for num in (8192, 32768)]
@@ -37,6 +38,7 @@ def test_memory_of_the_scoring_kernel_is_flat_in_candidates(recorded):
     assert used[1] < 2.0 * used[0]
 
 
+@pytest.mark.long
 def test_maps_of_all_sizes_hold_the_same_cells_in_the_middle(recorded):
     words = growth._field(recorded)
     size, cell = words.values.shape[0], float(words.resolution)

@@ -86,6 +86,7 @@ def test_a_tour_looks_into_dead_ends_and_comes_out_again(family):
     assert sum(b.any() and not b[np.flatnonzero(b)[0] :].all() for b in been) >= 2
 
 
+@pytest.mark.long
 def test_reaching_for_the_goal_leads_into_the_trap():
     poses, _ = driven("u")
     been = [in_pocket("u", seed, poses[KINDS.index("reach"), seed]) for seed in SEEDS]

@@ -56,6 +56,20 @@ def test_equals_the_recursion_in_numpy():
     np.testing.assert_allclose(np.asarray(dead_end.probability(belief)), want, atol=1e-6)
 
 
+def test_a_dead_end_that_may_hold_the_goal_is_less_of_a_risk():
+    rng = np.random.default_rng(1)
+    risk, away = rng.uniform(0, 1, SHAPE), rng.uniform(0, 9, SHAPE)
+    away.flat[:2] = 0.0, 40.0
+    f32 = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
+    got = np.asarray(dead_end.on_trip(PARAMS, f32(risk), f32(away), jnp.asarray(False)))
+    want = [r * (1 - math.exp(-((d / 3.0) ** 2))) for r, d in zip(risk.flat, away.flat, strict=True)]
+    np.testing.assert_allclose(got.ravel(), want, rtol=1e-5, atol=1e-7)
+    assert got.flat[0] == 0 and got.flat[1] == np.float32(risk.flat[1])
+    assert not np.any(dead_end.on_trip(PARAMS, f32(risk), f32(away), jnp.asarray(True)))
+    kept = dead_end.on_trip(PARAMS._replace(extent=0.0), f32(risk), f32(away), jnp.asarray(False))
+    np.testing.assert_array_equal(np.asarray(kept)[away > 0], f32(risk)[away > 0])
+
+
 @given(st.floats(1e-4, 1 - 1e-4))
 def test_probability_inverts_log_odds(p):
     back = dead_end.probability(dead_end.log_odds(jnp.float32(p)))

@@ -158,6 +158,7 @@ def test_images_are_numbers_between_black_and_white_and_follow_the_key():
     assert image(MIXED, RigSpec((), shape=(24, 32))).shape == (0, 24, 32, 3)
 
 
+@pytest.mark.long
 def test_the_sensor_has_the_stated_noise_gain_and_blur():
     world = world_of(sky_colour=(0.5, 0.5, 0.5), exposure=0.8)
     plain = image(world, LARGE)[0, :48]  # the sky

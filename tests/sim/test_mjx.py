@@ -484,6 +484,7 @@ def _bare():
     )  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("physics", [None, SPEC])
 def test_a_late_command_is_the_same_command_later(physics):
     rows = [(EMPTY, (0, 0, 0), (4.0, 0.0), 60.0), *ROWS_DRIVEN[1:]]  # straight ahead, so that nothing is steered late

@@ -66,6 +66,7 @@ def test_steps_lower_the_loss_and_the_average_follows(step):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), host(state.average), average)
 
 
+@pytest.mark.long
 def test_the_first_step_of_warm_up_changes_nothing_but_the_optimiser(step):
     state, _ = step(begun(), trimmed(batch(4)))
     jax.tree.map(np.testing.assert_array_equal, host(state.params), host(begun().params))

@@ -396,7 +396,10 @@ def test_families_turned_and_mirrored(family):
         assert np.mean(turned == turn(label)) >= SYMMETRY
 
 
-@pytest.mark.parametrize("families", [SMALL, pytest.param(CLOSED, marks=pytest.mark.slow)], ids=["small", "all"])
+@pytest.mark.parametrize(
+    "families",
+    [pytest.param(SMALL, marks=pytest.mark.long, id="small"), pytest.param(CLOSED, marks=pytest.mark.slow, id="all")],
+)
 def test_families_at_half_the_resolution(families):
     """All families together: one bay that is just deep enough on one of the grids says nothing."""
     both = either = 0
