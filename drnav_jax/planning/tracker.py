@@ -5,8 +5,9 @@ speeds at their limits; at every sample of that motion the footprint must stay c
 margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
 certified command in a static world; if the map changed its mind, the answer is to brake.
 
-Certified candidates are then rolled out in two halves - the second on along the arc, straight, or turning the other way
-round - and ranked by the time still needed from the last free pose of the best of the three,
+Certified candidates are then rolled out - straight on at once, or half the time along the arc and the rest on along it,
+straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still needed from
+the last free pose of the best of the four,
 
     J = (|g - p| + w_c sum ((d_soft - d) / (d_soft - d_block))_+^2 ds) / v_max + w_h |bearing error| / w_max
         + w_r (d_block - d_last)_+ + w_s |omega - omega_0| / w_max
@@ -29,6 +30,7 @@ from drnav_jax.planning.dynamics import Motion
 from drnav_jax.types import Command, GridMap, RobotParams, Scalar
 
 DIP = 0.004  # [m]
+WAYS = 4  # to go on after the tick
 TERMS = ("distance", "clearance", "heading", "room", "smoothness")  # of J, as `Critics` lists them
 
 
@@ -175,20 +177,24 @@ def track(
     # a slow robot looks twice as far ahead in time: what it needs there is room to turn, not reaction
     pace = jnp.where(jnp.abs(v0) < params.slow * robot.v_max, 2.0 * dt, dt)
 
-    def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
-        m, lack, free = carry
-        ahead = dynamics.advance(m, m.v, m.w, robot, pace)
-        near = room(ahead)
-        free = free & (near >= block)
-        m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
-        return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
+    def rolled(carry: tuple[Motion, Array, Array], turn: Array) -> tuple[Motion, Array, Array]:
+        """Half a rollout, at the speeds of the motion and turn rates that tend to `turn`."""
 
-    carry = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
-    half, _ = jax.lax.scan(roll, carry, None, length=spec.num_steps)
-    # then on along the arc, straight on, or the other way round: what gets a robot through a gap it is not in line with
-    m, lack, free = jax.tree.map(lambda a: jnp.tile(a, 3), half)
-    m = m._replace(w=jnp.concatenate([w, jnp.zeros_like(w), -w]))
-    (last, lack, _), _ = jax.lax.scan(roll, (m, lack, free), None, length=spec.num_steps)
+        def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
+            m, lack, free = carry
+            ahead = dynamics.advance(m, m.v, turn, robot, pace)
+            near = room(ahead)
+            free = free & (near >= block)
+            m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
+            return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
+
+        return jax.lax.scan(roll, carry, None, length=spec.num_steps)[0]
+
+    straight = jnp.zeros_like(w)
+    begun = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
+    kept, ended = rolled(begun, w), rolled(begun, straight)
+    halves = jax.tree.map(lambda a, b: jnp.concatenate([jnp.tile(a, 3), b]), kept, ended)
+    last, lack, _ = rolled(halves, jnp.concatenate([w, straight, -w, straight]))
     dx, dy = target[0] - last.x, target[1] - last.y
     distance = jnp.hypot(dx, dy)
     bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))
@@ -198,11 +204,11 @@ def track(
         params.clearance * lack / robot.v_max,
         params.heading * bearing / robot.w_max * jnp.minimum(distance / 0.5, 1.0),
         params.room * jnp.maximum(limit - near, 0.0),
-        params.smoothness * jnp.tile(jnp.abs(w - w0), 3) / robot.w_max,
+        params.smoothness * jnp.tile(jnp.abs(w - w0), WAYS) / robot.w_max,
     ])  # fmt: skip
     only_room = jnp.asarray([name == "room" for name in TERMS])[:, None]
     terms = jnp.where(seek_room, jnp.where(only_room, -near[None], 0.0), terms)
-    cost = jnp.sum(terms, axis=0).reshape(3, -1)
+    cost = jnp.sum(terms, axis=0).reshape(WAYS, -1)
     way, cost = jnp.argmin(cost, axis=0), jnp.min(cost, axis=0)
     cost = jnp.where(certified, cost, jnp.inf)
     count = v.shape[0]
