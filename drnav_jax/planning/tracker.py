@@ -5,8 +5,8 @@ speeds at their limits; at every sample of that motion the footprint must stay c
 margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
 certified command in a static world; if the map changed its mind, the answer is to brake.
 
-Certified candidates are then rolled out - straight on at once, or half the time along the arc and the rest on along it,
-straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still needed from
+Certified candidates are then rolled out - one step and then straight on, or half the time along the arc and the rest on along
+it, straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still needed from
 the last free pose of the best of the four,
 
     J = (|g - p| + w_c sum ((d_soft - d) / (d_soft - d_block))_+^2 ds) / v_max + w_h |bearing error| / w_max
@@ -177,24 +177,23 @@ def track(
     # a slow robot looks twice as far ahead in time: what it needs there is room to turn, not reaction
     pace = jnp.where(jnp.abs(v0) < params.slow * robot.v_max, 2.0 * dt, dt)
 
-    def rolled(carry: tuple[Motion, Array, Array], turn: Array) -> tuple[Motion, Array, Array]:
-        """Half a rollout, at the speeds of the motion and turn rates that tend to `turn`."""
+    def roll(carry: tuple[Motion, Array, Array], turn: Array) -> tuple[tuple[Motion, Array, Array], None]:
+        """One step at the speeds of the motion, and turn rates that tend to `turn`."""
+        m, lack, free = carry
+        ahead = dynamics.advance(m, m.v, turn, robot, pace)
+        near = room(ahead)
+        free = free & (near >= block)
+        m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
+        return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
 
-        def roll(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], None]:
-            m, lack, free = carry
-            ahead = dynamics.advance(m, m.v, turn, robot, pace)
-            near = room(ahead)
-            free = free & (near >= block)
-            m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
-            return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
-
-        return jax.lax.scan(roll, carry, None, length=spec.num_steps)[0]
-
+    begun, _ = roll((start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool)), w)
     straight = jnp.zeros_like(w)
-    begun = (start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool))
-    kept, ended = rolled(begun, w), rolled(begun, straight)
-    halves = jax.tree.map(lambda a, b: jnp.concatenate([jnp.tile(a, 3), b]), kept, ended)
-    last, lack, _ = rolled(halves, jnp.concatenate([w, straight, -w, straight]))
+    halves = jax.tree.map(lambda a: jnp.tile(a, 2), begun)
+    turns = jnp.concatenate([w, straight])
+    halves, _ = jax.lax.scan(lambda carry, _: roll(carry, turns), halves, None, length=spec.num_steps - 1)
+    halves = jax.tree.map(lambda a: jnp.concatenate([jnp.tile(a[: w.size], 3), a[w.size :]]), halves)
+    ends = jnp.concatenate([w, straight, -w, straight])
+    (last, lack, _), _ = jax.lax.scan(lambda carry, _: roll(carry, ends), halves, None, length=spec.num_steps)
     dx, dy = target[0] - last.x, target[1] - last.y
     distance = jnp.hypot(dx, dy)
     bearing = jnp.abs(jnp.arctan2(last.c * dy - last.s * dx, last.c * dx + last.s * dy))

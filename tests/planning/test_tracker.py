@@ -153,9 +153,9 @@ def test_what_cannot_be_certified_brakes(clearance_of):
     assert bool(go(clear, [0.3, 0.0, 0.0], [0.4, 0.0], [5.0, 0.0]).certified)
 
 
-def drive(clear, pose, target, ticks, seek_room=False):
+def drive(clear, pose, target, ticks, seek_room=False, twist=(0.0, 0.0)):
     """Closed loop with exact arcs; poses `[ticks + 1, 3]` and commands."""
-    pose, twist = np.asarray(pose, np.float64), np.zeros(2)
+    pose, twist = np.asarray(pose, np.float64), np.asarray(twist, np.float64)
     poses, commands, certified = [pose], [], []
     for _ in range(ticks):
         got = go(clear, pose, twist, target, seek_room)
@@ -204,6 +204,16 @@ def test_it_passes_a_door_but_not_a_slit(clearance_of):
         poses, _, _ = drive(clear, [-1.2, 0.1, 0.2], [1.5, 0.0], 60)
         assert (poses[-1, 0] > 0.8) == through
         assert room_of(clear, poses).min() >= LIMIT - BETWEEN
+
+
+@pytest.mark.parametrize("turn", [-1.3, -0.7, 1.1])
+def test_a_robot_between_walls_does_not_go_on_spinning(clearance_of, turn):
+    occupied = np.ones(SHAPE, bool)
+    occupied[23:37, 33:47] = False  # 0.7 m each way: room to turn, hardly any to drive
+    clear = clearance_of(occupied, ORIGIN, RESOLUTION)
+    poses, commands, _ = drive(clear, [0.0, 0.0, -0.1 * np.sign(turn)], [0.7, 0.0], 30, twist=(0.0, turn))
+    assert np.abs(poses[:, 2]).max() < 0.1 + 1.5 * turn**2 / (2 * ROBOT.alpha_max) + 0.2, "no farther than it must"
+    assert np.abs(poses[-1, 2]) < 0.2 and np.abs(commands[-1, 1]) < 0.1
 
 
 def test_seeking_room_leads_out_of_a_squeeze(clearance_of):
