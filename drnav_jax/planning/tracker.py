@@ -5,9 +5,9 @@ speeds at their limits; at every sample of that motion the footprint must stay c
 margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
 certified command in a static world; if the map changed its mind, the answer is to brake.
 
-Certified candidates are then rolled out - one step and then straight on, or half the time along the arc and the rest on along
-it, straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still needed from
-the last free pose of the best of the four,
+Certified candidates are then rolled out - one step and then straight on, or half the time along the arc and the rest on
+along it, straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still
+needed from the last free pose of the best of the four,
 
     J = (|g - p| + w_c sum ((d_soft - d) / (d_soft - d_block))_+^2 ds) / v_max + w_h |bearing error| / w_max
         + w_r (d_block - d_last)_+ + w_s |omega - omega_0| / w_max
