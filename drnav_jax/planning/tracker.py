@@ -186,6 +186,7 @@ def track(
         m = jax.tree.map(lambda a, b: jnp.where(free, a, b), ahead, m)
         return (m, lack + jnp.square(jnp.maximum((soft - near) * slope, 0.0)) * jnp.abs(m.v) * pace, free), None
 
+    # straight on at once is what ends a turn; the other way round gets a robot through a gap it is not in line with
     begun, _ = roll((start, jnp.zeros_like(v), jnp.ones_like(v, dtype=bool)), w)
     straight = jnp.zeros_like(w)
     halves = jax.tree.map(lambda a: jnp.tile(a, 2), begun)
