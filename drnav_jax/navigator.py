@@ -228,7 +228,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     if planner.predicts:
         evidence = spec.predictor(params.predictor, seen, local)
         everywhere = jnp.ones(grid.shape, bool)  # where it has nothing to say its confidence is 0
-        held = belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every)
+        held = grids.once(belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every))
         risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
     assert local.closed is not None
     clear = costmap.clearance(local.closed, grid.resolution)
@@ -243,7 +243,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
     room = grids.flood_fill(local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here), here)
     if planner.predicts:
         shown = geometry.sample_nearest(GridMap(room, local.origin, grid.resolution), goal, fill=False)
-        risk = dead_end.on_trip(params.filter.dead_end, risk, jnp.hypot(x - goal[0], y - goal[1]), shown)
+        risk = grids.once(dead_end.on_trip(params.filter.dead_end, risk, jnp.hypot(x - goal[0], y - goal[1]), shown))
     if planner.recovery == "drnav":
         points = recovery_points.observe(
             spec.recovery_points, params.recovery_points, points, local, dead_end.probability(held.dead_end), room,

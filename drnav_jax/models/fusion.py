@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drnav_jax import geometry
+from drnav_jax import geometry, grids
 from drnav_jax.models import bev, calibration, geometric, network
 from drnav_jax.models.batch import FREE, OCCUPIED, Inputs
 from drnav_jax.models.calibration import Calibration
@@ -157,7 +157,8 @@ def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMa
         p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
         confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
         barred = blocked(spec, params, observation, known, out.traversable)
-        found = evidence(spec, observation.pose, p_dead, confidence, barred, local_map)
+        cells = grids.once((p_dead, confidence, barred))  # or the last layers were computed anew per cell of the window
+        found = evidence(spec, observation.pose, *cells, local_map)
         return found._replace(repeats=jnp.asarray(params.repeats, jnp.float32))
 
     return predict

@@ -192,3 +192,24 @@ def test_one_trace_and_batches_equal_loops():
 
     many = jax.vmap(batched)(f32(range(3)))
     chex.assert_trees_all_close(jax.tree.map(lambda *a: jnp.stack(a), *one), many, atol=1e-5)
+
+
+@pytest.mark.parametrize("aside", [-0.1, -0.03, 0.0, 0.04, 0.1])
+@pytest.mark.parametrize("before", [0.4, 1.1])
+def test_a_door_that_the_tracker_would_pass_is_gone_through(before, aside):
+    """Six cells from the middle to either post, 5 cm beyond the radius, which the tracker's margin of 4 cm lets pass."""
+    resolution, shape, wall, middle = 0.05, (61, 83), 50, 30
+    origin = np.array([-2.525, -1.525], np.float32)  # the door's middle is a cell's, at 0, 0
+    occupied = np.zeros(shape, bool)
+    occupied[:, wall] = True
+    occupied[middle - 5 : middle + 6, wall] = False
+    clear = np.minimum(ndimage.distance_transform_edt(~occupied) * resolution, 1.0)
+    assert clear[middle, wall] == pytest.approx(ROBOT.radius + 0.05)
+    x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
+    y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
+    plan = costmap.pack_plan(f32(np.zeros(shape)), f32(np.hypot(x[None, :] - 4.0, y[:, None])))
+    words = GridMap(costmap.pack_clearance(plan, f32(clear)), f32(origin), resolution)
+    pose = [-before, aside, 0.0]
+    found = choose(words, goal=(4.0, 0.0), last=pose[:2], pose=pose, spec=GeneratorSpec())
+    assert found.valid
+    assert found.xy[0] > 0.3
