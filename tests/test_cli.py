@@ -241,6 +241,7 @@ def test_the_table_says_what_the_runners_up_pay_more():
     assert lines[-1].endswith("all blocked") and any(line.endswith("no other") for line in lines)
 
 
+@pytest.mark.long
 def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, monkeypatch):
     drive = evaluate.evaluate
 
@@ -263,7 +264,7 @@ def test_an_interrupted_compare_keeps_the_planners_that_are_finished(capsys, mon
     ("flags", "message"),
     [
         pytest.param((), "no weights of the fusion network (train some", marks=pytest.mark.long),
-        (("--no-cameras",), "the robot has no cameras"),
+        pytest.param(("--no-cameras",), "the robot has no cameras", marks=pytest.mark.long),
     ],
 )
 def test_the_rule_stands_in_for_the_network(capsys, flags, message):
@@ -315,6 +316,7 @@ def test_in_a_shell_mistakes_are_exit_code_2_without_traceback():
     assert done.stderr.startswith("drnav: error: unknown family 'nowhere'") and done.stderr.count("\n") == 1
 
 
+@pytest.mark.long
 def test_in_a_shell_json_is_all_there_is_on_stdout():
     done = shell("run", *SHORT, "--planner", "dwa", "--json", "--no-pictures", "--out", "z")
     assert done.returncode == 0, done.stderr

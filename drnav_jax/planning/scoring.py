@@ -67,7 +67,7 @@ class ScoreParams(NamedTuple):
     range_least: Scalar = 0.3  # [] shorter prefixes are no candidates [m]
     range_max: Scalar = 5.0  # [] endpoints lie no farther than this [m]
     soft_clearance: Scalar = 0.4  # [] beyond the radius: where the clearance term begins [m]
-    margin: Scalar = 0.03  # [] beyond the radius: closer counts as blocked; words err by some 0.02 [m]
+    margin: Scalar = 0.045  # [] beyond the radius: closer is blocked; more than the tracker's, less than a cell [m]
     curved: Scalar = 2.0  # [] handicap of curved candidates, whose end the tracker does not approach along the curve [m]
     horizon: Scalar = 4.0  # [] H [s]
 

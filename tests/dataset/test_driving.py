@@ -93,6 +93,7 @@ def test_reaching_for_the_goal_leads_into_the_trap():
     assert sum(b.sum() > 20 for b in been) >= 3
 
 
+@pytest.mark.long
 def test_a_wall_is_followed_at_its_distance():
     poses, gaps = driven("t-open")
     k = KINDS.index("wall")

@@ -7,6 +7,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from drnav_jax.dataset import job
 
 SCRIPT = """
@@ -48,6 +50,7 @@ def test_one_worker_is_no_process():
         assert pool.submit(os.getpid).result() == os.getpid()
 
 
+@pytest.mark.long
 def test_processes_are_prepared_and_do_not_outlive_a_kill(tmp_path):
     script = tmp_path / "gather.py"
     script.write_text(SCRIPT)

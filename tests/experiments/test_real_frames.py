@@ -34,6 +34,7 @@ def street(count):
     return small_bag.drive(count, points=lambda m, k, ns: m.cloud(ns, cloud), without=(small_bag.ODOM,))
 
 
+@pytest.mark.long
 def test_one_command_gives_figures_and_pictures(tmp_path, trained):
     bag = small_bag.write(tmp_path / "bag", street(3))
     config = Config(

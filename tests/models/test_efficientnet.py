@@ -109,7 +109,7 @@ def test_what_cannot_be_is_refused(changes, says):
 
 
 # Published: width, depth, and parameters with 1,000 classes of B0 and B2
-PUBLISHED = [(1.0, 1.0, 5_288_548), (1.1, 1.2, 9_109_994)]
+PUBLISHED = [(1.0, 1.0, 5_288_548), pytest.param(1.1, 1.2, 9_109_994, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize(("width", "depth", "parameters"), PUBLISHED)

@@ -259,9 +259,9 @@ def drive(spec, params, ticks, wall=True):
     [
         {},
         {"noise": NoiseSpec(antithetic=True, bank=1000), "num_disturbances": 3},
-        {"noise": NoiseSpec(kind="low_pass", bank=400), "adapt_temperature": True},
+        pytest.param({"noise": NoiseSpec(kind="low_pass", bank=400), "adapt_temperature": True}, marks=pytest.mark.long),
         {"rate_space": True},
-        {"immediate": True, "noise": NoiseSpec(bank=400)},
+        pytest.param({"immediate": True, "noise": NoiseSpec(bank=400)}, marks=pytest.mark.long),
     ],
 )
 def test_it_drives_along_the_path_within_the_limits(change):

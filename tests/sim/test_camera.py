@@ -52,7 +52,7 @@ def depth(world, spec=SMALL, pose=ORIGIN, **how):
 
 
 @pytest.mark.parametrize("mounts", [FRONT_LEFT_RIGHT, TILTED])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))])
 def test_depth_is_that_of_mujocos_renderer(mounts, seed):
     spec, poses = RigSpec(mounts, shape=(72, 96)), np.array([[0.0, 0.0, 0.3], [0.2, -0.1, 2.0]], np.float32)
     world, ground = (random_obstacles(seed, n, extent=12.0) for n in (60, 0))
@@ -189,6 +189,7 @@ def test_what_a_pane_shows_is_what_lies_behind_it():
     assert frame.any() and not frame[:, :3].any() and not frame[:, -3:].any()
 
 
+@pytest.mark.long
 def test_plants_have_ragged_edges_and_grass_lets_light_through():
     back = block(6.0, 0.0, 0.1, 9.0, 9.0, colour=(0.9, 0.1, 0.9))
     shares = {}

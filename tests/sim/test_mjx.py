@@ -387,6 +387,7 @@ def test_uniform_draws_between_its_ends():
     assert 0 < faults.slip_v < 0.3 and faults.delay == 0
 
 
+@pytest.mark.long
 def test_vmap_is_a_loop_and_a_sweep_compiles_once():
     world = jax.tree.map(np.asarray, random_obstacles(5, 60, extent=5.0))
     solids = rows_of(world, WALL, EMPTY)

@@ -92,7 +92,7 @@ def test_what_a_run_leaves_behind(whole, validation):
     assert (t.dead.scale, t.dead.offset) != (1.0, 0.0)
 
 
-@pytest.mark.parametrize("stop", [3, 5])
+@pytest.mark.parametrize("stop", [3, pytest.param(5, marks=pytest.mark.long)])
 def test_killed_and_resumed_is_the_same_bit_for_bit(whole, validation, tmp_path, stop):
     """Killed at a checkpoint, and two steps beyond one, when a line of the log was half written."""
     out = tmp_path / "run"
@@ -156,6 +156,7 @@ def test_it_refuses_what_is_not_its_own(whole, validation, tmp_path):
         run(tmp_path / "none", validation, resume=True)
 
 
+@pytest.mark.long
 def test_a_run_killed_before_its_first_checkpoint_begins_anew(validation, tmp_path, whole):
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):

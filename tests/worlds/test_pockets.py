@@ -97,6 +97,7 @@ def random_plan(rng):
     return grid
 
 
+@pytest.mark.long
 def test_recovery_points_equal_brute_force():
     met = 0
     for seed in range(22):
