@@ -157,8 +157,9 @@ def predictor(spec: NetworkSpec) -> Callable[[FusionParams, Observation, LocalMa
         p_dead = jnp.where(sound, jax.nn.sigmoid(out.dead), 0.5)
         confidence = jnp.where(sound, trust(spec, params, observation, known), 0.0)
         barred = blocked(spec, params, observation, known, out.traversable)
-        cells = grids.once((p_dead, confidence, barred))  # or the last layers were computed anew per cell of the window
-        found = evidence(spec, observation.pose, *cells, local_map)
+        # once, or the network's last layers would be computed anew for each cell of the window
+        p_dead, confidence, barred = grids.once((p_dead, confidence, barred))
+        found = evidence(spec, observation.pose, p_dead, confidence, barred, local_map)
         return found._replace(repeats=jnp.asarray(params.repeats, jnp.float32))
 
     return predict
