@@ -28,21 +28,21 @@ def f32(values):
     return jnp.asarray(values, jnp.float32)
 
 
-def centres():
-    x = ORIGIN[0] + (np.arange(SHAPE[1]) + 0.5) * RESOLUTION
-    y = ORIGIN[1] + (np.arange(SHAPE[0]) + 0.5) * RESOLUTION
+def centres(shape=SHAPE, resolution=RESOLUTION, origin=ORIGIN):
+    x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
+    y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
     return np.meshgrid(x, y)
 
 
-def field(occupied=None, risk=0.0, goal=(20.0, 0.0), value=None):
-    x, y = centres()
+def field(occupied=None, risk=0.0, goal=(20.0, 0.0), value=None, resolution=RESOLUTION, origin=ORIGIN):
     occupied = np.zeros(SHAPE, bool) if occupied is None else occupied
-    clear = np.full(SHAPE, 1.0)
+    x, y = centres(occupied.shape, resolution, origin)
+    clear = np.full(occupied.shape, 1.0)
     if occupied.any():
-        clear = np.minimum(ndimage.distance_transform_edt(~occupied) * RESOLUTION, 1.0)
+        clear = np.minimum(ndimage.distance_transform_edt(~occupied) * resolution, 1.0)
     value = np.hypot(x - goal[0], y - goal[1]) if value is None else value
     plan = costmap.pack_plan(f32(risk + 0 * x), f32(value))
-    return GridMap(costmap.pack_clearance(plan, f32(clear)), f32(ORIGIN), RESOLUTION)
+    return GridMap(costmap.pack_clearance(plan, f32(clear)), f32(origin), resolution)
 
 
 def choose(words, goal=(20.0, 0.0), last=(0.0, 0.0), hysteresis=0.3, pose=HERE, twist=STILL, params=PARAMS, spec=SPEC):
@@ -202,12 +202,9 @@ def test_a_door_that_the_tracker_would_pass_is_gone_through(before, aside):
     occupied = np.zeros(shape, bool)
     occupied[:, wall] = True
     occupied[middle - 5 : middle + 6, wall] = False
-    clear = np.minimum(ndimage.distance_transform_edt(~occupied) * resolution, 1.0)
-    assert clear[middle, wall] == pytest.approx(ROBOT.radius + 0.05)
-    x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
-    y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
-    plan = costmap.pack_plan(f32(np.zeros(shape)), f32(np.hypot(x[None, :] - 4.0, y[:, None])))
-    words = GridMap(costmap.pack_clearance(plan, f32(clear)), f32(origin), resolution)
+    words = field(occupied, goal=(4.0, 0.0), resolution=resolution, origin=origin)
+    near, _, _ = costmap.unpack(words.values)
+    assert near[middle, wall] == pytest.approx(ROBOT.radius + 0.05)
     pose = [-before, aside, 0.0]
     found = choose(words, goal=(4.0, 0.0), last=pose[:2], pose=pose, spec=GeneratorSpec())
     assert found.valid
