@@ -291,6 +291,14 @@ def test_one_trace_for_a_sweep(trip):
     assert [len(found) for found in scores.values()] == [4, 4]
 
 
+def without_ties(stepped):
+    """The step's results; where two prefixes of a candidate are equally good, rounding says which is shown."""
+    state, command, info = stepped
+    best = info.local_goal.best
+    best = best._replace(progress=best.progress + best.range_bias, range_bias=best.range_bias * 0)
+    return state, command, info._replace(local_goal=info.local_goal._replace(best=best))
+
+
 def compare_batch(record, replan):
     """One vmapped call over recorded states against single calls."""
     states, seen = (jax.tree.map(lambda *a: jnp.stack(a), *[r[k] for r in record]) for k in (0, 1))
@@ -300,7 +308,7 @@ def compare_batch(record, replan):
     one = [step(SPEC, PARAMS, r[0], r[1], KEY, replan=replan) for r in record]
     one = jax.tree.map(lambda *a: jnp.stack(a), *one)
     chex.assert_trees_all_close(many[1], one[1], atol=SAME)  # commands
-    for a, b in zip(jax.tree.leaves(many), jax.tree.leaves(one), strict=True):
+    for a, b in zip(jax.tree.leaves(without_ties(many)), jax.tree.leaves(without_ties(one)), strict=True):
         if a.dtype in (jnp.bool_, jnp.int32):
             assert float(jnp.mean((a == b).astype(jnp.float32))) > 0.999
         else:

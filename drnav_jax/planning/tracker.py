@@ -2,8 +2,8 @@
 
 Candidates are the speeds reachable within one tick. Each is certified first: drive it for one tick, then brake both
 speeds at their limits; at every sample of that motion the footprint must stay clear (or, if it stands closer than the
-margin already, must not come closer). Braking from a certified motion is itself a candidate, so there is always a
-certified command in a static world; if the map changed its mind, the answer is to brake.
+margin already, must not come closer; by `DIP` it may). Braking from a certified motion is itself a candidate, so there is
+always a certified command in a static world; if the map changed its mind, the answer is to brake.
 
 Certified candidates are then rolled out - one step and then straight on, or half the time along the arc and the rest on
 along it, straight, or turning the other way round, at the angular acceleration there is - and ranked by the time still
@@ -165,11 +165,12 @@ def track(
         return (m, jnp.minimum(least, near)), None
 
     (end, least), _ = jax.lax.scan(brake, drive(start), None, length=spec.brake_ticks)
-    # who stands closer than the margin may go, if that leads away; a dip of DIP is noise of the map
+    # A dip of DIP is noise of the map: who stands at the margin may come closer by that much, or every dip would hold a
+    # robot beside a wall. Who is closer still may go if that leads away.
     limit = robot.radius + params.margin
     block = jnp.minimum(limit, here - DIP)
     still = (v == 0) & (w == 0)
-    certified = ((least >= block) & (room(end) >= jnp.minimum(limit, here)) & (jnp.abs(end.v) < 1e-3)) | still
+    certified = ((least >= block) & (room(end) >= jnp.minimum(limit - DIP, here)) & (jnp.abs(end.v) < 1e-3)) | still
 
     soft = robot.radius + params.soft_clearance
     slope = 1.0 / jnp.maximum(params.soft_clearance - params.margin, 1e-3)

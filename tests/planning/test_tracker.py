@@ -206,6 +206,19 @@ def test_it_passes_a_door_but_not_a_slit(clearance_of):
         assert room_of(clear, poses).min() >= LIMIT - BETWEEN
 
 
+@pytest.mark.parametrize("x", [-1.2, -0.9, -0.33])
+def test_a_wall_does_not_hold_a_robot_that_stands_at_the_margin(clearance_of, x):
+    occupied = np.zeros(SHAPE, bool)
+    occupied[:20] = True
+    clear = clearance_of(occupied, ORIGIN, RESOLUTION)
+    heights = np.arange(ORIGIN[1], 1.0, 1e-4)
+    at = np.stack([np.full_like(heights, x), heights, np.zeros_like(heights)], axis=1)
+    y = heights[np.argmax(room_of(clear, at) >= LIMIT)]
+    poses, _, _ = drive(clear, [x, y, -0.08], [x + 0.5, y - 0.02], 25)  # every way on leads nearer by some 0.1 mm
+    assert poses[-1, 0] > x + 0.15
+    assert room_of(clear, poses).min() >= LIMIT - 2 * tracker.DIP - 1e-3
+
+
 @pytest.mark.parametrize("turn", [-1.3, -0.7, 1.1])
 def test_a_robot_between_walls_does_not_go_on_spinning(clearance_of, turn):
     occupied = np.ones(SHAPE, bool)
