@@ -29,6 +29,7 @@ from drnav_jax.worlds.truth import TruthSpec, truth
 PREDICTORS = ("fusion", "geometric", "oracle", "none")
 PHYSICS = ("kinematic", "mjx")
 STEP_LENGTH = 0.0125  # [m] that the fastest robot moves in one time step of MJX: how deep it may enter an obstacle
+MAX_SPEED = 2.5  # [m/s] from which the DWA's certificate still stops (`TrackerSpec.brake_ticks`)
 LABEL_RESOLUTION = 0.1  # [m] labels need no finer grid
 
 
@@ -80,7 +81,7 @@ class Setup:
         if self.predictor not in PREDICTORS:
             raise ValueError(f'There is no predictor "{self.predictor}": choose from {", ".join(PREDICTORS)}.')
         rules = {
-            "robot_radius": (0.05, 0.4, "m"), "max_speed": (0.05, 3.0, "m/s"), "lidar_range": (1.0, 12.0, "m"),
+            "robot_radius": (0.05, 0.4, "m"), "max_speed": (0.05, MAX_SPEED, "m/s"), "lidar_range": (1.0, 12.0, "m"),
             "goal_tolerance": (0.05, 10.0, "m"), "time_limit": (1.0, 1e5, "s"), "horizon": (0.5, 4.0, "s"),
             "risk_weight": (0.0, 1e3, ""), "limit_factor": (1.0, 1e3, ""),
         }  # fmt: skip
@@ -236,10 +237,11 @@ def params_of(setup: Setup) -> NavParams:
     """The navigator's parameters under this setup, before any world is known."""
     params = NavParams()
     robot = RobotParams(radius=setup.robot_radius, v_max=setup.max_speed)
-    score, route = params.score, params.route
+    score, route, critics = params.score, params.route, params.follower.critics
     if setup.risk_weight is not None:
         score = score._replace(risk_weight=setup.risk_weight)
         route = route._replace(risk_weight=setup.risk_weight)
+        critics = critics._replace(exposure=critics.exposure._replace(weight=setup.risk_weight))
     if setup.horizon is not None:
         score = score._replace(horizon=setup.horizon)
     occupancy = params.filter.occupancy._replace(max_range=setup.lidar_range)
@@ -251,7 +253,7 @@ def params_of(setup: Setup) -> NavParams:
     if setup.evidence == "oracle":  # its labels are those of the trip
         belief = belief._replace(extent=0.0)
     return params._replace(
-        robot=robot, score=score, route=route, predictor=predictor,
+        robot=robot, score=score, route=route, predictor=predictor, follower=params.follower._replace(critics=critics),
         filter=params.filter._replace(occupancy=occupancy, dead_end=belief),
     )  # fmt: skip
 
@@ -333,6 +335,9 @@ def evaluate(
     """
     if not trips:
         raise ValueError("there is no trip to drive.")
+    ticks, robots = (spec.dt, spec.replan_every), (setup.nav.dt, setup.nav.replan_every)
+    if ticks != robots:
+        raise ValueError(f"the simulation's tick [s] and its ticks per replan, {ticks}, must be the robot's, {robots}.")
     begin = time.perf_counter()
     batch = episode_params(trips, setup, params)
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
@@ -341,7 +346,7 @@ def evaluate(
     kept = [k for k in range(len(trips)) if result.finished[k]]
     if not kept:
         raise KeyboardInterrupt
-    records = [_record(trips[k], result, k, setup.max_speed) for k in kept]
+    records = [_record(trips[k], result, k, setup.max_speed, spec.dt) for k in kept]
     return Evaluation(
         records=records,
         summary=metrics.summary(records, [trips[k].time_limit for k in kept]),
@@ -353,7 +358,7 @@ def evaluate(
     )
 
 
-def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[str, Any]:
+def _record(trip: Trip, result: episode.Result, k: int, v_max: float, dt: float) -> dict[str, Any]:
     state, scene = result.state, trip.scene
     assert scene.start is not None and scene.goal is not None
     ticks = int(result.log.active[k].sum())
@@ -361,7 +366,7 @@ def _record(trip: Trip, result: episode.Result, k: int, v_max: float) -> dict[st
         world=scene.name,
         success=bool(state.success[k]),
         collision=bool(state.collision[k]),
-        time=ticks * EpisodeSpec().dt,
+        time=ticks * dt,
         distance=float(state.distance[k]),
         away=float(state.retreat[k]),
         clearance=float(state.min_clearance[k]),

@@ -14,7 +14,7 @@ from drnav_jax.types import RigSpec, rig_of
 from drnav_jax.viz import TopView, Truth
 from drnav_jax.worlds import Material, Scene, World
 from drnav_jax.worlds.materials import BLOCKS
-from drnav_jax.worlds.truth import truth
+from drnav_jax.worlds.truth import TruthSpec, truth
 
 CAMERAS = ("front", "left", "right")
 PIXELS = 288  # of an image
@@ -76,7 +76,7 @@ def picture(file: Path, scene: Scene, radius: float = 0.25, seed: int = 0) -> Pa
     length, path = worlds.check_trip(scene, radius, radius + MARGIN - 0.25)
     assert scene.start is not None
     pose = np.asarray(scene.start, np.float32)
-    found = truth(scene, trip_path=path)
+    found = truth(scene, TruthSpec(radius=radius), trip_path=path)
     points, valid = scan(LidarSpec(), LidarParams(), scene.world, jnp.asarray(pose), jax.random.key(seed))
     points = np.asarray(points)
     met = np.asarray(valid) & (np.linalg.norm(points - [0, 0, 0.5], axis=1) < LidarParams().max_range - 1e-3)

@@ -34,8 +34,9 @@ from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
 from drnav_jax.planning.route import RouteParams, RouteSpec
 from drnav_jax.planning.scoring import ScoreParams
 from drnav_jax.planning.tracker import Track, TrackerParams, TrackerSpec
-from drnav_jax.types import Command, Evidence, GridMap, LocalMap, Observation, RobotParams, Scalar
+from drnav_jax.types import Command, Evidence, GridMap, LocalMap, Observation, RobotParams, Scalar, sane
 
+_FAR = 1 << 20  # [cells] so far that nothing of the window stays
 _NO_PLAN = -(1 << 16)  # the word of a cell that has only just come into the window: no risk, the worst value
 
 Predictor = Callable[[Any, Observation, LocalMap], Evidence]
@@ -79,8 +80,11 @@ class NavSpec:
         memory.check(self.memory, self.filter.grid)
         if self.dt <= 0 or self.replan_every < 1:
             raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
-        if self.planner.tracker == "mppi" and abs(self.follower.mppi.dt - self.dt) > 1e-6:
-            raise ValueError(f"MPPI's step must be the tick, {self.dt} s: follower.mppi.dt is {self.follower.mppi.dt}.")
+        follower.check(self.follower, self.planner, self.dt)
+        if abs(self.tracker.dt - self.dt) > 1e-6:
+            raise ValueError(f"tracker.dt must be the tick, {self.dt} s, got {self.tracker.dt}.")
+        if self.recovery_points.grid != self.filter.grid:
+            raise ValueError(f"recovery_points.grid must be the window, {self.filter.grid}.")
         if not self.planner.controls:
             object.__setattr__(self, "generator", dataclasses.replace(self.generator, num_speeds=0))
 
@@ -162,34 +166,12 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
     )
 
 
-def _sane(params: NavParams, state: NavState, seen: Observation) -> tuple[Observation, Array, Array]:
-    """The observation with broken values replaced; whether the pose is usable, whether it leapt."""
-    pose_ok = jnp.all(jnp.isfinite(seen.pose))
-    pose = jnp.where(pose_ok, seen.pose, state.last_pose)
-    leap = jnp.hypot(pose[0] - state.last_pose[0], pose[1] - state.last_pose[1]) > params.pose_jump
-    twist_ok = jnp.all(jnp.isfinite(seen.twist))
-    valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok
-    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3))
-    return (
-        seen._replace(
-            pose=pose,
-            twist=jnp.where(twist_ok, seen.twist, state.last_command),
-            points=jnp.where(valid[:, None], seen.points, 0.0),
-            point_valid=valid,
-            images=jnp.where(image_ok[:, None, None, None], seen.images, 0.0),
-            image_valid=seen.image_valid & image_ok,
-            goal=jnp.where(jnp.all(jnp.isfinite(seen.goal)), seen.goal, pose[:2]),
-        ),
-        pose_ok, leap,
-    )  # fmt: skip
-
-
 def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observation, leap: Array) -> NavState:
-    """Move the window and fold the scan in; after a leap of odometry the old map is dropped first."""
+    """Move the window and fold the scan in; after a leap of odometry whatever has a place is forgotten first."""
     fresh = lambda: belief.init(spec.filter, params.filter, seen.pose[:2])  # noqa: E731
     kept = jax.lax.cond(leap, fresh, lambda: state.belief)
     moved, _ = belief.observe(spec.filter, params.filter, kept, seen.pose, seen.points, seen.point_valid)
-    by = moved.corner - state.belief.corner
+    by = jnp.where(leap, _FAR, moved.corner - state.belief.corner)
 
     def shifted() -> tuple[Array, Array, Array, MemoryState]:
         return (
@@ -199,7 +181,15 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
 
     unmoved = lambda: (state.plan, state.risk, state.recovery.visits, state.memory)  # noqa: E731
     plan, risk, visits, held = jax.lax.cond(jnp.any(by != 0), shifted, unmoved)
-    return state._replace(belief=moved, plan=plan, risk=risk, memory=held, recovery=state.recovery._replace(visits=visits))
+    following = state.follower
+    if following is not None:
+        following = follower.forget(following, leap)
+    return state._replace(
+        belief=moved, plan=plan, risk=risk, memory=held, follower=following,
+        points=state.points._replace(valid=state.points.valid & ~leap),
+        recovery=behaviour.forget(state.recovery, leap)._replace(visits=visits),
+        local_goal=jnp.where(leap, seen.pose[:2], state.local_goal),
+    )  # fmt: skip
 
 
 def _fine_clearance(spec: NavSpec, params: NavParams, held: FilterState) -> Float[Array, "n n"]:
@@ -250,7 +240,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
             state.time,
         )  # fmt: skip
         goal = jnp.where(retreating, recover.target, goal)
-    found = None
+    found, late = None, jnp.asarray(False)
     if planner.needs_route or planner.recovery == "drnav":
         priced = jnp.where(retreating, 0.0, risk) if planner.risk_in_route else nothing
         squeeze = (state.time < state.squeeze_until) | retreating
@@ -268,12 +258,13 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         )  # fmt: skip
         value, reachable = found.value, found.reachable
         until = jnp.where(reachable, state.squeeze_until, state.time + params.squeeze_time)
+        late = ~reachable & ~squeeze  # narrow ways are looked for at the next replan: the last plan holds until then
     else:
         value, reachable, until = nothing, jnp.asarray(True), state.squeeze_until
     exposed = risk
     if planner.progress == "straight":
         direct = route.straight(grid.shape, local.origin, grid.resolution, seen.goal)
-        value, reachable = jnp.where(retreating, value, direct), reachable | ~retreating
+        value, reachable, late = jnp.where(retreating, value, direct), reachable | ~retreating, jnp.asarray(False)
         exposed = jnp.maximum(risk, visits)  # no route that visits could be priced in: they count as exposure
     exposed = exposed if planner.exposure else nothing
     if planner.recovery == "drnav":
@@ -292,10 +283,12 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
             spec.follower, planner, following, found, local.origin, grid.resolution * spec.route.pooling, seen.pose[:2],
             goal, state.time,
         )  # fmt: skip
+        following = jax.tree.map(lambda old, new: jnp.where(late, old, new), state.follower, following)
     return state._replace(
-        belief=held, risk=risk, plan=costmap.pack_plan(exposed, value), reachable=reachable, squeeze_until=until,
-        points=points, memory=remembered, recovery=recover, follower=following,
-    )
+        belief=held, risk=risk, plan=jnp.where(late, state.plan, costmap.pack_plan(exposed, value)),
+        reachable=jnp.where(late, state.reachable, reachable), squeeze_until=until, points=points, memory=remembered,
+        recovery=recover, follower=following,
+    )  # fmt: skip
 
 
 def _act(
@@ -393,7 +386,8 @@ def step(
     Returns:
         The new state, the command (finite, within speed and acceleration limits) and what one looks at.
     """
-    seen, healthy, leap = _sane(params, state, observation)
+    seen, healthy = sane(observation, state.last_pose, state.last_command)
+    leap = jnp.hypot(seen.pose[0] - state.last_pose[0], seen.pose[1] - state.last_pose[1]) > params.pose_jump
     state = _perceive(spec, params, state, seen, leap)
     if replan:
         state = _replan(spec, params, state, seen)

@@ -11,7 +11,7 @@ import numpy as np
 
 from drnav_jax import geometry, metrics, viz
 from drnav_jax.filter import FilterSpec, belief, dead_end
-from drnav_jax.planning import recovery
+from drnav_jax.planning import nav2_recovery, recovery
 from drnav_jax.sim.episode import EpisodeState
 from drnav_jax.types import GridMap
 from drnav_jax.worlds import Scene
@@ -50,6 +50,13 @@ def finite(tree: Any) -> Any:
 def dumps(tree: Any) -> str:
     """JSON text; the same tree gives the same bytes."""
     return json.dumps(finite(tree), indent=2, allow_nan=False)
+
+
+def write(file: Path, tree: Any) -> None:
+    """Write `dumps` of a tree; under another name first, so that a file holds all of it or what it held before."""
+    part = file.with_name(f"{file.name}.part")
+    part.write_text(dumps(tree) + "\n")
+    part.replace(file)
 
 
 def outline(tree: Mapping[str, Any], indent: str = "") -> str:
@@ -177,6 +184,7 @@ def _frame(state: EpisodeState, local: Any, seen: np.ndarray, p_dead: np.ndarray
     mind, tick = state.policy, int(state.tick)
     occupied = np.asarray(dead_end.probability(local.occupancy), np.float16)
     origin, resolution = np.asarray(local.origin), np.asarray(local.resolution)
+    nav2 = None if mind.follower is None else mind.follower.recovery
     return viz.Frame(
         pose=np.asarray(state.pose),
         path=path[: tick + 1],
@@ -184,7 +192,7 @@ def _frame(state: EpisodeState, local: Any, seen: np.ndarray, p_dead: np.ndarray
         p_dead=_grid(p_dead, origin, resolution),
         recovery_points=np.asarray(mind.points.xy)[np.asarray(mind.points.valid)],
         local_goal=np.asarray(mind.local_goal),
-        mode=MODES[int(mind.recovery.mode)],
+        mode=MODES[int(mind.recovery.mode if nav2 is None else nav2_recovery.as_drnav(nav2.mode))],
         time=tick * dt,
     )
 

@@ -216,6 +216,31 @@ def empty_observation(num_points: int, rig: RigSpec = NO_CAMERAS) -> Observation
     )
 
 
+def sane(
+    seen: Observation, pose: Float[Array, "3"], twist: Float[Array, "2"]
+) -> tuple[Observation, Bool[Array, ""]]:
+    """An observation without broken values, and whether its pose can be used.
+
+    Args:
+        seen: As it came; what is not finite counts as missing.
+        pose: What stands in for a broken pose; then no point is valid, since nobody knows where it is.
+        twist: What stands in for broken speeds.
+    """
+    pose_ok = jnp.all(jnp.isfinite(seen.pose))
+    pose = jnp.where(pose_ok, seen.pose, pose)
+    valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok
+    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3))
+    return seen._replace(
+        pose=pose,
+        twist=jnp.where(jnp.all(jnp.isfinite(seen.twist)), seen.twist, twist),
+        points=jnp.where(valid[:, None], seen.points, 0.0),
+        point_valid=valid,
+        images=jnp.where(image_ok[:, None, None, None], seen.images, 0.0),
+        image_valid=seen.image_valid & image_ok,
+        goal=jnp.where(jnp.all(jnp.isfinite(seen.goal)), seen.goal, pose[:2]),
+    ), pose_ok
+
+
 class LocalMap(NamedTuple):
     """What a predictor may know of the surroundings: the rolling window as the filter believes it."""
 

@@ -23,6 +23,7 @@ import tyro
 from drnav_jax import evaluate, report
 from drnav_jax.evaluate import Setup, Trip
 from drnav_jax.planning import recovery
+from drnav_jax.scripts import script
 from drnav_jax.sim import FaultParams, episode
 from drnav_jax.sim.episode import EpisodeSpec
 from drnav_jax.types import RobotParams
@@ -153,6 +154,8 @@ class Config:
             raise ValueError(f'There is no case "{unknown[0]}": choose from {", ".join(CASES)}.')
         if self.minutes * 60 < 2 * STILL:
             raise ValueError(f"minutes must be >= {2 * STILL / 60:.2f}, got {self.minutes}.")
+        if self.predictor == "oracle":
+            raise ValueError("these cases have no labels for an oracle: choose fusion, geometric or none.")
         for name in self.planners.split(","):
             Setup(planner=name, predictor=self.predictor)
 
@@ -237,7 +240,8 @@ def driven(config: Config, planner: str) -> dict[str, dict[str, Any]]:
     faults: Any = jax.tree.map(lambda *a: np.asarray(a, np.float32), *[case.faults for case in cases.values()])
     keys = jax.random.split(jax.random.key(setup.seed), len(trips))
     progress = lambda done: print(f"\radversarial: {planner} {done}/{len(trips)} ", end="", file=sys.stderr)  # noqa: E731
-    result = episode.run(SPEC, evaluate.policy_of(setup.nav), batch._replace(faults=faults), keys, progress=progress)
+    spec = evaluate.equipped(SPEC, setup)
+    result = episode.run(spec, evaluate.policy_of(setup.nav), batch._replace(faults=faults), keys, progress=progress)
     if not result.finished.all():
         raise KeyboardInterrupt
     records = {}
@@ -251,9 +255,10 @@ def main(config: Config) -> dict[str, Any]:
     """Drive every planner; the figures, written under `out` as well."""
     rows = {planner: driven(config, planner) for planner in config.planners.split(",")}
     print(file=sys.stderr)
-    result = {"experiment": "adversarial", "seed": config.seed, "minutes": config.minutes, "planners": rows}
+    head = {"experiment": "adversarial", "seed": config.seed, "minutes": config.minutes, "predictor": config.predictor}
+    result = head | {"planners": rows}
     config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / f"adversarial-{config.seed}.json").write_text(report.dumps(result) + "\n")
+    report.write(config.out / f"adversarial-{config.seed}.json", result)
     return result
 
 
@@ -271,6 +276,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    asked = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
-    done = main(asked)
-    print(report.dumps(done) if asked.json else table(done))
+    sys.exit(script(Config, main, table, __doc__))

@@ -26,6 +26,7 @@ import tyro
 from drnav_jax import evaluate, metrics, report, sources, worlds
 from drnav_jax.evaluate import Evaluation, Setup, Trip
 from drnav_jax.filter import belief, dead_end
+from drnav_jax.scripts import script
 from drnav_jax.sim import episode
 from drnav_jax.sim.episode import EpisodeSpec
 from drnav_jax.types import GridMap
@@ -206,7 +207,7 @@ def main(config: Config) -> dict[str, Any]:
     for group in config.groups:
         result["groups"][group] = driven(config, group)
         print(file=sys.stderr)
-        (config.out / f"closed_loop-{config.seed}.json").write_text(report.dumps(result) + "\n")
+        report.write(config.out / f"closed_loop-{config.seed}.json", result)
     return result
 
 
@@ -231,6 +232,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    asked = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
-    done = main(asked)
-    print(report.dumps(done) if asked.json else table(done))
+    sys.exit(script(Config, main, table, __doc__))

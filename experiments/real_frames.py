@@ -14,6 +14,7 @@ what LiDAR holds to be free is called traversable, and what it holds to be occup
 
 import dataclasses
 import math
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from drnav_jax.models import bev, fusion, weights
 from drnav_jax.models.batch import FREE, OCCUPIED
 from drnav_jax.models.fusion import FusionParams
 from drnav_jax.models.network import NetworkSpec
+from drnav_jax.scripts import script
 from drnav_jax.types import LocalMap, Observation
 
 WAYS = ("front", "left", "right")
@@ -123,10 +125,11 @@ def spec_of(config: Config) -> bags.BagSpec:
 
 def chosen(config: Config) -> list[bags.Recorded]:
     """The frames."""
-    found = list(bags.read(config.data, spec_of(config)))
-    if not config.frames or len(found) <= config.frames:
-        return found
-    return [found[k] for k in np.linspace(0, len(found) - 1, config.frames).round().astype(int)]
+    if not config.frames:
+        return list(bags.read(config.data, spec_of(config)))
+    count = sum(1 for _ in bags.read(config.data, spec_of(config)))  # one at a time: a bag may be larger than the memory
+    wanted = set(np.linspace(0, count - 1, min(config.frames, count)).round().astype(int).tolist())
+    return [frame for k, frame in enumerate(bags.read(config.data, spec_of(config))) if k in wanted]
 
 
 def _share(mask: np.ndarray, among: np.ndarray) -> float:
@@ -222,11 +225,9 @@ def main(config: Config) -> dict[str, Any]:
         "experiment": "real_frames", "data": config.data.name, "weights_sha256": trained.sha256,
         "image": {"shape": list(config.shape), "fov_deg": config.fov}, "summary": summary(rows, spent), "frames": rows,
     }  # fmt: skip
-    (config.out / "frames.json").write_text(report.dumps(result) + "\n")
+    report.write(config.out / "frames.json", result)
     return result
 
 
 if __name__ == "__main__":
-    given = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
-    done = main(given)
-    print(report.dumps(done) if given.json else report.outline(done["summary"]))
+    sys.exit(script(Config, main, lambda done: report.outline(done["summary"]), __doc__))

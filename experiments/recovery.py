@@ -21,6 +21,7 @@ import tyro
 from drnav_jax import evaluate, metrics, report, worlds
 from drnav_jax.evaluate import Setup, Trip
 from drnav_jax.planning.refuge import RefugeParams
+from drnav_jax.scripts import script
 from drnav_jax.worlds.truth import GroundTruth, TruthSpec, truth
 
 CLOSED = tuple(name for name, base in worlds.FAMILIES.items() if name == base != "open")
@@ -209,7 +210,7 @@ def main(config: Config) -> dict[str, Any]:
             result["ablation"][f"{name} = 0"] = summed(found) | {"ratio": against(full, found)}
             print(f"recovery: ablation of {name} done", file=sys.stderr)
     config.out.mkdir(parents=True, exist_ok=True)
-    (config.out / f"recovery-{config.seed}.json").write_text(report.dumps(result | {"episodes": records}) + "\n")
+    report.write(config.out / f"recovery-{config.seed}.json", result | {"episodes": records})
     return result
 
 
@@ -230,6 +231,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    asked = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
-    done = main(asked)
-    print(report.dumps(done) if asked.json else table(done))
+    sys.exit(script(Config, main, table, __doc__))

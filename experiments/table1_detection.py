@@ -28,6 +28,7 @@ from drnav_jax import dataset, report, viz, worlds
 from drnav_jax.bench.network import latency
 from drnav_jax.models import clip, network, views, vlm, weights
 from drnav_jax.models.batch import NOW, Batch, batch_of
+from drnav_jax.scripts import script
 from drnav_jax.sim.lidar import LidarSpec
 from drnav_jax.train import faults, validate
 from drnav_jax.train.validate import Predictions
@@ -281,7 +282,7 @@ def main(config: Config) -> dict[str, Any]:
     if ours is not None and config.loss_frames:
         result["sensor_loss"] = with_losses(config, batches, judged)
     named = f"table1-{config.split}-{config.seed}"
-    (config.out / f"{named}.json").write_text(report.dumps(result) + "\n")
+    report.write(config.out / f"{named}.json", result)
     if ours is not None:
         file = viz.samples(config.out / f"{named}.png", pictured(config, ours, batches, families))
         print(f"table1: wrote {file}", file=sys.stderr)
@@ -303,6 +304,4 @@ def table(result: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    asked = tyro.cli(Config, description=__doc__, config=(tyro.conf.FlagCreatePairsOff,))
-    done = main(asked)
-    print(report.dumps(done) if asked.json else table(done))
+    sys.exit(script(Config, main, table, __doc__))

@@ -328,8 +328,18 @@ def test_bench_prints_what_it_measures(capsys, monkeypatch):
     monkeypatch.setattr(cli.bench, "run", lambda quick=False: {"episodes_per_s": 2.5, "machine": {"quick": quick}})
     code, out, _ = call(capsys, "bench", "--quick", "--json")
     assert code == 0 and json.loads(out) == {"episodes_per_s": 2.5, "machine": {"quick": True}}
+    monkeypatch.setattr(cli.bench, "table", lambda result: f"{result['episodes_per_s']} /s")
     code, out, _ = call(capsys, "bench")
-    assert out.splitlines() == ["episodes_per_s: 2.5", "machine", "  quick: False"]
+    assert (code, out) == (0, "2.5 /s\n")
+
+
+def test_what_is_not_installed_is_said_without_traceback(capsys, monkeypatch):
+    def show(args):
+        raise MissingExtra
+
+    monkeypatch.setattr(cli.data, "show", show)
+    code, out, err = call(capsys, "worlds", "--world", "u:0")
+    assert (code, out) == (2, "") and err.startswith("drnav: error: ") and "viz" in err and len(err.splitlines()) == 1
 
 
 def test_bench_writes_how_things_grow(capsys, monkeypatch):

@@ -34,8 +34,8 @@ def test_time_limit_rule():
     scene = worlds.sample("u", 0)
     (trip,) = evaluate.prepare([scene], evaluate.Setup())
     assert trip.time_limit == pytest.approx(6 * trip.shortest) and trip.time_limit > 60
-    (fast,) = evaluate.prepare([scene], evaluate.Setup(max_speed=3.0))
-    assert fast.time_limit == 60.0 > 6 * fast.shortest / 3.0
+    (fast,) = evaluate.prepare([scene], evaluate.Setup(max_speed=2.5))
+    assert fast.time_limit == 60.0 > 6 * fast.shortest / 2.5
     own = dataclasses.replace(scene, time_limit=100.0, goal_tolerance=1.0)
     (barn,) = evaluate.prepare([own], evaluate.Setup())
     assert (barn.time_limit, barn.goal_tolerance) == (100.0, 1.0)

@@ -26,6 +26,7 @@ RANKS = {
     "train": 3,
     "bench": 3,
     "report": 3,
+    "scripts": 3.2,
     "sources": 3,
     "navigator": 2,
     "models": 1,

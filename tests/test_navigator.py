@@ -241,6 +241,14 @@ def test_after_a_leap_the_old_map_is_dropped(trip):
     fresh = init(SPEC, PARAMS, seen.pose + f32([5.0, -3.0, 1.0]))
     want, _, _ = step(SPEC, PARAMS, fresh, broken("pose jump", seen), KEY, replan=False)
     chex.assert_trees_all_equal(leapt.belief, want.belief)
+    for name in ("free", "east", "north"):
+        np.testing.assert_array_equal(getattr(leapt.memory, name), getattr(want.memory, name), err_msg=name)
+    assert (np.asarray(leapt.plan) == np.asarray(leapt.plan)[0, 0]).all()
+    for name in ("risk", "local_goal"):
+        np.testing.assert_array_equal(getattr(leapt, name), getattr(want, name), err_msg=name)
+    assert bool(state.points.valid.any()) and not bool(leapt.points.valid.any())
+    assert bool(state.recovery.visits.any()) and int(leapt.recovery.mode) == behaviour.DRIVE
+    assert float(leapt.recovery.visits.max()) < 0.2, "but for what it drove just now"
 
 
 def test_at_the_goal_it_brakes(trip):
@@ -391,7 +399,9 @@ def test_every_planner_fits_together(planner):
     [
         ({"dt": 0.0}, "dt must be > 0 s"),
         ({"replan_every": 0}, "replan_every >= 1"),
+        ({"dt": 0.05}, "tracker.dt must be the tick, 0.05 s, got 0.1"),
         ({"planner": PLANNERS["mppi"], "dt": 0.05}, "MPPI's step must be the tick, 0.05 s: follower.mppi.dt is 0.1"),
+        ({"recovery_points": RecoverySpec()}, "recovery_points.grid must be the window"),
     ],
 )
 def test_the_spec_is_checked(wrong, message):

@@ -92,6 +92,8 @@ def points_of(message: Any) -> Float[np.ndarray, "n 3"]:
     raw, row = np.ascontiguousarray(message.data), message.point_step * message.width
     if message.height and (message.row_step < row or raw.size < message.row_step * message.height):
         raise ValueError(f"a cloud of {message.height} x {message.width} points has only {raw.size} bytes: it is cut off.")
+    if not row * message.height:
+        return np.zeros((0, 3))
     raw = raw[: message.row_step * message.height].reshape(message.height, -1)[:, :row]
     found = np.frombuffer(raw.tobytes(), kind)
     return np.stack([found[name].astype(np.float64) for name in "xyz"], axis=-1)

@@ -6,7 +6,8 @@ from drnav_jax import __version__, bench, report
 from drnav_jax.bench import growth
 from drnav_jax.cli import data, drive, learn, process
 from drnav_jax.cli.flags import Bench, Command, Compare, Dataset, Run, Train, Trial, Worlds, parse
-from drnav_jax.cli.terminal import INTERRUPTED, stdout_kept
+from drnav_jax.cli.terminal import stdout_kept
+from drnav_jax.scripts import ended
 from drnav_jax.viz import MissingExtra
 
 __all__ = ["Bench", "Command", "Compare", "Dataset", "Run", "Train", "Trial", "Worlds", "main", "parse"]
@@ -21,7 +22,8 @@ def _measure(args: Bench) -> int:
         except MissingExtra as error:
             print(f"drnav: no picture: {error}", file=sys.stderr)
         print(f"drnav: wrote {args.scaling}/", file=sys.stderr)
-    print(report.dumps(result) if args.json else report.outline(result))
+    table = bench.table if args.scaling is None else report.outline
+    print(report.dumps(result) if args.json else table(result))
     return 0
 
 
@@ -45,16 +47,14 @@ def main(argv: list[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"drnav {__version__}")
         return 0
-    try:
+
+    def work() -> int:
         args = parse(argv)
         process.prepare()
         process.end_as_interrupted()
         return _perform(args)
-    except SystemExit:
+
+    try:
+        return ended(work)
+    except SystemExit:  # after --help
         return 0
-    except KeyboardInterrupt:
-        print("drnav: interrupted.", file=sys.stderr)
-        return INTERRUPTED
-    except (ValueError, OSError) as error:
-        print(f"drnav: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2

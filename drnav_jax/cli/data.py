@@ -6,7 +6,8 @@ from pathlib import Path
 from drnav_jax import dataset, gallery, report, sources
 from drnav_jax.cli import process
 from drnav_jax.cli.flags import Dataset, Worlds
-from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.cli.terminal import Bar, stdout_kept
+from drnav_jax.scripts import INTERRUPTED
 
 
 def show(args: Worlds) -> int:

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import re
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +14,10 @@ import jax
 from drnav_jax import __version__, evaluate, report, sources
 from drnav_jax.cli import explain
 from drnav_jax.cli.flags import Compare, Run, Trial
-from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.cli.terminal import Bar, stdout_kept
 from drnav_jax.models import weights
 from drnav_jax.planning import planner
+from drnav_jax.scripts import INTERRUPTED
 from drnav_jax.sim import episode
 from drnav_jax.viz import MissingExtra
 from drnav_jax.worlds import Scene
@@ -79,7 +81,7 @@ def folder_of(args: Run | Compare) -> Path:
     out = args.out or Path("results") / f"{_command(args)}-{re.sub(r'[^A-Za-z0-9._-]+', '-', source)}"
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "summary.json").open("a").close()
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise ValueError(f"{out}: cannot be written to ({error.strerror}); choose another --out.") from None
     return out
@@ -182,10 +184,9 @@ def perform(args: Run | Compare) -> int:
     for old in [out / "belief.gif", out / "explain.jsonl", *out.glob("trajectory*.png")]:
         old.unlink(missing_ok=True)
     result = result_of(args, finished)
-    text = report.dumps(result)
-    (out / "summary.json").write_text(text + "\n")
+    report.write(out / "summary.json", result)
     if args.json:
-        print(text, flush=True)
+        print(report.dumps(result), flush=True)
     else:
         summaries = {name: e.summary for name, e in finished.evaluations.items()}
         print(report.table(summaries, result.get("ratios")), flush=True)
@@ -206,7 +207,7 @@ def perform(args: Run | Compare) -> int:
         except KeyboardInterrupt:
             interrupted = True
     timing = {"planners": walls, "total_s": time.perf_counter() - begin, "backend": jax.default_backend()}
-    (out / "timing.json").write_text(report.dumps(timing) + "\n")
+    report.write(out / "timing.json", timing)
     note = "interrupted; what was finished is in" if interrupted else "wrote"
     print(f"drnav: {note} {out}/", file=sys.stderr)
     return INTERRUPTED if interrupted else 0

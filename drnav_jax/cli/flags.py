@@ -41,7 +41,7 @@ class Trial:
         recovery: What planners do when stuck; nav2: clear, spin, wait and back up in turn.
         no_cameras: The robot has a LiDAR only; the geometric rule stands in for the network.
         risk_weight: Lambda of eq. 1 and 7; 0 = dead ends do not matter.
-        horizon: H, how far ahead candidates are rolled out [s].
+        horizon: H, how far ahead the goal generator rolls its candidates out [s]; the other planners have none.
         seed: Of sensor noise and of sampled trips.
         split: Which worlds a family's seeds mean.
         physics: How the robot moves; mjx: with inertia, grip and contact forces.

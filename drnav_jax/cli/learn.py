@@ -6,8 +6,9 @@ from typing import Any
 from drnav_jax import dataset, report, train
 from drnav_jax.cli import process
 from drnav_jax.cli.flags import Train
-from drnav_jax.cli.terminal import INTERRUPTED, Bar, stdout_kept
+from drnav_jax.cli.terminal import Bar, stdout_kept
 from drnav_jax.models.batch import Batch, batch_of
+from drnav_jax.scripts import INTERRUPTED
 
 CHUNK = 64  # validation frames at a time
 

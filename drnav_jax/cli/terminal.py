@@ -4,7 +4,6 @@ import contextlib
 import sys
 import time
 
-INTERRUPTED = 130  # exit code, as shells have it
 SILENCE = 30.0  # [s] between two lines where there is no terminal
 
 

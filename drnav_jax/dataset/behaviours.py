@@ -118,7 +118,7 @@ def reach(
     return memory._replace(at=at), chosen.command
 
 
-def _mood(plan: Plan, memory: Memory, pose: Array, key: PRNGKeyArray) -> Memory:
+def _mood(memory: Memory, pose: Array, key: PRNGKeyArray) -> Memory:
     """Wandering of the heading, looks around, and how long the robot has not got away from where it was."""
     k_wander, k_look, k_long, k_turn = jax.random.split(key, 4)
     wander = 0.95 * memory.wander + 0.31 * WANDER * jax.random.normal(k_wander, (), jnp.float32)
@@ -162,4 +162,4 @@ def step(
         v=jnp.where(looking, 0.0, command.v),
         omega=jnp.where(looking, memory.turn * 0.8 * robot.w_max, command.omega),
     )
-    return _mood(plan, memory, pose, key), command
+    return _mood(memory, pose, key), command

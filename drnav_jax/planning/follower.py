@@ -8,7 +8,7 @@
     recovery   Nav2's round robin, if the composition has it
 
 Numbers are Nav2's bringup, but for what has to follow the robot: horizons, sampling and what is measured by them
-(`FollowerParams`) scale with its speed, and strides with the time between two commands, which must be MPPI's step. The
+(`FollowerParams`) are given for 1 m/s, and strides with the time between two commands, which must be MPPI's step. The
 route's clearance is about as dear as NavFn's 1 + 0.016 cost: 4.5 beside an obstacle, 1 from 0.7 m on.
 """
 
@@ -37,6 +37,7 @@ from drnav_jax.planning.tracker import Critics, Track
 from drnav_jax.types import GridMap, RobotParams, Scalar
 
 # missions have no yaw at the goal: GoalAngle, and DWB's rotation in the goal window, have nothing to do
+_LONG_AGO = -1e6  # [s]
 _CRITICS = ("Constraint", "Cost", "Goal", "PathAlign", "PathFollow", "PathAngle", "PreferForward")
 
 
@@ -104,6 +105,12 @@ def mppi_critics_of(spec: FollowerSpec, planner: Composition) -> CriticSpec:
     return dataclasses.replace(spec.critics, critics=(*spec.critics.critics, "Exposure"))
 
 
+def check(spec: FollowerSpec, planner: Composition, dt: float) -> None:
+    """Raise a ValueError if MPPI would not take its steps in ticks of `dt` [s]."""
+    if planner.tracker == "mppi" and abs(spec.mppi.dt - dt) > 1e-6:
+        raise ValueError(f"MPPI's step must be the tick, {dt} s: follower.mppi.dt is {spec.mppi.dt}.")
+
+
 def critics(spec: FollowerSpec, planner: Composition) -> tuple[str, ...]:
     """Names of what `Track.critics` holds, of whatever tracker."""
     own = {"dwa": tracker.TERMS, "dwb": dwb_critics.CRITICS}
@@ -117,14 +124,19 @@ def init(
     """Standing still, without a path; None where the composition needs none of it."""
     if not planner.follows and planner.recovery != "nav2":
         return None
-    far = jnp.asarray(-1e6, jnp.float32)
     here = Path(jnp.full(spec.num_points, pose[0]), jnp.full(spec.num_points, pose[1]), jnp.asarray(1, jnp.int32))
     # the bank's key is fixed: like Nav2's, it is drawn once, and every command reads another part of it
     held = mppi.init(spec.mppi, params.mppi, jax.random.key(0)) if planner.tracker == "mppi" else None
     return FollowerState(
-        path=here, path_time=far, has_path=jnp.asarray(True), dwb=dwb_critics.init() if planner.tracker == "dwb" else None,
+        path=here, path_time=jnp.asarray(_LONG_AGO, jnp.float32), has_path=jnp.asarray(True),
+        dwb=dwb_critics.init() if planner.tracker == "dwb" else None,
         mppi=held, recovery=nav2_recovery.init(pose) if planner.recovery == "nav2" else None,
     )  # fmt: skip
+
+
+def forget(state: FollowerState, leap: Bool[Array, ""]) -> FollowerState:
+    """After a `leap` of odometry the path is somewhere else: a new one is due."""
+    return state._replace(path_time=jnp.where(leap, _LONG_AGO, state.path_time))
 
 
 def replan(

@@ -32,7 +32,7 @@ class NoiseSpec:
     Attributes:
         kind: One of `KINDS`.
         antithetic: The second half of the sequences is the negative of the first.
-        bank: Sequences drawn once and reused; 0 draws fresh ones every time.
+        bank: Sequences drawn once and reused, an even number of antithetic ones; 0 draws fresh ones every time.
     """
 
     kind: str = "white"
@@ -45,6 +45,8 @@ class NoiseSpec:
             raise ValueError(f'There is no noise "{self.kind}": choose from {", ".join(KINDS)}.')
         if self.bank < 0:
             raise ValueError(f"bank must be >= 0 sequences, got {self.bank}.")
+        if self.antithetic and self.bank % 2:
+            raise ValueError(f"a bank of antithetic sequences holds pairs: its size must be even, got {self.bank}.")
 
 
 class NoiseParams(NamedTuple):

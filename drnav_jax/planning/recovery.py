@@ -138,6 +138,14 @@ def wait(state: RecoveryState, time: Scalar, waiting: Bool[Array, ""]) -> Recove
     )  # fmt: skip
 
 
+def forget(state: RecoveryState, leap: Bool[Array, ""]) -> RecoveryState:
+    """After a `leap` of odometry no place means anything: drive on, and go back to none that was seen before it."""
+    return state._replace(
+        mode=jnp.where(leap, DRIVE, state.mode), attempts=jnp.where(leap, 0, state.attempts),
+        has_refuge=state.has_refuge & ~leap,
+    )  # fmt: skip
+
+
 @partial(jax.jit, static_argnames="spec")
 def update(
     spec: GridSpec,

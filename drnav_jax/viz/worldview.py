@@ -17,7 +17,6 @@ HATCHES: dict[str, tuple[str, str]] = {
     "GLASS": ("#0077b6", "////"), "BUSH": ("#1b5e20", "xxx"), "GRASS": ("#7cb342", "..."), "DROP": ("#000000", "\\\\\\\\"),
     "STRIPE": ("#b8860b", "||"), "METAL": ("#37474f", ""), "CAR": ("#5d4037", ""),
 }  # fmt: skip
-LIDAR = "#d6249f"
 KNOWN = ((0.62, 0.64, 0.68), (1.0, 1.0, 1.0), (0.17, 0.18, 0.2))  # of cells that are unknown, free, occupied
 DEPTHS = "YlOrRd"
 
@@ -47,7 +46,7 @@ class Truth(NamedTuple):
     recovery_points: Numbers  # [M, 2] [m]
 
 
-def _region(view: TopView, margin: float = 2.5) -> tuple[float, float, float, float]:
+def _region(view: TopView) -> tuple[float, float, float, float]:
     """x_min, x_max, y_min, y_max of what is worth showing: the map."""
     x, y = (float(v) for v in np.asarray(view.origin))
     h, w = np.shape(view.occupied)

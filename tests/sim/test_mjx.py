@@ -331,13 +331,15 @@ def test_slip_moves_the_robot_less_than_its_wheels():
     [(Material.WALL, True), (Material.GLASS, True), (Material.BUSH, True), (Material.CAR, True),
      (Material.DROP, True), (Material.GRASS, False), (Material.STRIPE, False)],
 )  # fmt: skip
-def test_what_blocks_stops_it_at_any_height(material, stops):
+def test_what_blocks_stops_it_unless_it_passes_under(material, stops):
     low, high = (-2.0, 0.0) if material == Material.DROP else (1.0, 2.0)
     box = make_world([[2.0, 0.0, 0.0, 0.5, 2.0, low, high]], box_surfaces=surfaces(1, material))
     post = make_world(cylinders=[[2.0, 0.0, 0.5, low, high]], cylinder_surfaces=surfaces(1, material))
     for world in (box, post):
         poses, _, _ = drive(single(world), [(1.0, 0.0)] * 30)
         assert poses[-1, 0] == pytest.approx(1.5 - RADIUS, abs=1e-3) if stops else poses[-1, 0] > 2.5
+    above = make_world([[2.0, 0.0, 0.0, 0.5, 2.0, 2.1, 2.5]], [[2.0, 0.0, 0.5, 1.6, 3.0]])  # a lintel, a crown
+    assert drive(single(above), [(1.0, 0.0)] * 30)[0][-1, 0] > 2.5
 
 
 def test_a_grid_map_stops_it_where_its_cells_are():
