@@ -30,6 +30,17 @@ def test_setup_names_what_is_wrong(wrong):
         evaluate.Setup(**wrong)
 
 
+def test_the_risk_weight_reaches_all_who_price_risk():
+    params = evaluate.params_of(evaluate.Setup(predictor="geometric", risk_weight=0.5))
+    assert [params.score.risk_weight, params.route.risk_weight, params.follower.critics.exposure.weight] == [0.5] * 3
+
+
+def test_the_simulation_keeps_the_robots_time():
+    (trip,) = evaluate.prepare([worlds.sample("u", 0)], evaluate.Setup())
+    with pytest.raises(ValueError, match="must be the robot's"):
+        evaluate.evaluate([trip], evaluate.Setup(), spec=EpisodeSpec(dt=0.05))
+
+
 def test_time_limit_rule():
     scene = worlds.sample("u", 0)
     (trip,) = evaluate.prepare([scene], evaluate.Setup())

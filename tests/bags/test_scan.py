@@ -13,6 +13,9 @@ def test_clouds_of_any_layout():
     points = np.array([[1, 2, 3], [np.nan, 5, 6], [7, 8, 9], [10, 11, 12], [13, 14, 15], [16, 17, 18]], np.float32)
     make = Maker()
     np.testing.assert_array_equal(scan.points_of(make.cloud(0, points)), points)
+    nothing = make.cloud(0, points[:0])
+    nothing.height = nothing.width = nothing.row_step = 0  # a cloud that was cleared
+    assert scan.points_of(nothing).shape == (0, 3)
     # big-endian doubles after an intensity, two rows of three points, each row padded
     rows = []
     for row in points.reshape(2, 3, 3):

@@ -73,7 +73,10 @@ def test_verdicts():
 
 
 def test_the_config_is_checked():
-    wrongs = [({"cases": "fire"}, "no case"), ({"minutes": 0.1}, "minutes"), ({"planners": "x"}, "no planner")]
+    wrongs = [
+        ({"cases": "fire"}, "no case"), ({"predictor": "oracle"}, "no labels"), ({"minutes": 0.1}, "minutes"),
+        ({"planners": "x"}, "no planner"),
+    ]  # fmt: skip
     for wrong, message in wrongs:
         with pytest.raises(ValueError, match=message):
             Config(**wrong)

@@ -94,5 +94,7 @@ def test_what_cannot_be_is_refused():
         NoiseSpec("pink")
     with pytest.raises(ValueError, match="bank must be >= 0"):
         NoiseSpec(bank=-1)
+    with pytest.raises(ValueError, match="must be even, got 51"):
+        NoiseSpec(antithetic=True, bank=51)
     with pytest.raises(ValueError, match="bank must be >= num_samples"):
         noise.fill(NoiseSpec(bank=10), NoiseParams(), KEY, STEPS, 20)
