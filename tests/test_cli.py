@@ -282,6 +282,7 @@ def test_weights_that_are_named_must_be_there(capsys):
     assert code == 2 and err.count("\n") == 1 and "none.safetensors" in err and not Path("results").exists()
 
 
+@pytest.mark.long
 def test_planners_that_do_not_predict_need_no_predictor(capsys):
     code, _, err = call(capsys, "run", *SHORT, "--planner", "dwa", "--no-pictures")
     assert code == 0 and "network" not in err

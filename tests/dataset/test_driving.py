@@ -105,6 +105,7 @@ def test_a_wall_is_followed_at_its_distance():
         assert np.hypot(*np.diff(path[:, :2], axis=0).T).sum() > 6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["tour", "errand", "wall"])
 def test_they_keep_off_the_walls(kind):
     for family in FAMILIES:

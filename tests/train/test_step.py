@@ -74,6 +74,7 @@ def test_the_first_step_of_warm_up_changes_nothing_but_the_optimiser(step):
     assert any(np.abs(m).max() > 0 for m in moments)
 
 
+@pytest.mark.long
 def test_gradients_are_clipped(step):
     """The first moment after one step is a tenth of the clipped gradient."""
     state, said = step(begun(), trimmed(batch(4)))
