@@ -52,11 +52,12 @@ def dumps(tree: Any) -> str:
     return json.dumps(finite(tree), indent=2, allow_nan=False)
 
 
-def write(file: Path, tree: Any) -> None:
-    """Write `dumps` of a tree; under another name first, so that a file holds all of it or what it held before."""
-    part = file.with_name(f"{file.name}.part")
-    part.write_text(dumps(tree) + "\n")
+def write(file: Path, tree: Any) -> str:
+    """Write `dumps` of a tree, which is returned; first under another name, so that no file is half written."""
+    text, part = dumps(tree), file.with_name(f"{file.name}.part")
+    part.write_text(text + "\n")
     part.replace(file)
+    return text
 
 
 def outline(tree: Mapping[str, Any], indent: str = "") -> str:

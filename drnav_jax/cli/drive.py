@@ -184,9 +184,9 @@ def perform(args: Run | Compare) -> int:
     for old in [out / "belief.gif", out / "explain.jsonl", *out.glob("trajectory*.png")]:
         old.unlink(missing_ok=True)
     result = result_of(args, finished)
-    report.write(out / "summary.json", result)
+    text = report.write(out / "summary.json", result)
     if args.json:
-        print(report.dumps(result), flush=True)
+        print(text, flush=True)
     else:
         summaries = {name: e.summary for name, e in finished.evaluations.items()}
         print(report.table(summaries, result.get("ratios")), flush=True)

@@ -8,7 +8,7 @@
     recovery   Nav2's round robin, if the composition has it
 
 Numbers are Nav2's bringup, but for what has to follow the robot: horizons, sampling and what is measured by them
-(`FollowerParams`) are given for 1 m/s, and strides with the time between two commands, which must be MPPI's step. The
+(`FollowerParams`) are those of one that drives 1 m/s, and strides follow the tick, which must be MPPI's step. The
 route's clearance is about as dear as NavFn's 1 + 0.016 cost: 4.5 beside an obstacle, 1 from 0.7 m on.
 """
 

@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from drnav_jax.worlds.materials import BLOCKS
 from drnav_jax.worlds.rectangles import wall_boxes
-from drnav_jax.worlds.world import FAR, HEADROOM, World
+from drnav_jax.worlds.world import FAR, World, blocking
 
 PAD = 32  # arrays of solids grow in steps of this many rows, so that similar batches share a program
 BEYOND = 100.0  # [m] from a point: where rows lie that only fill up
@@ -24,10 +23,8 @@ class Solids(NamedTuple):
 
 def _rows(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Boxes `[N, 5]` and posts `[N, 3]` of one world that stop a robot; a grid's walls are among the boxes."""
-    boxes = np.asarray(world.boxes, np.float64)[BLOCKS[np.asarray(world.box_surfaces.material)]]
-    posts = np.asarray(world.cylinders, np.float64)[BLOCKS[np.asarray(world.cylinder_surfaces.material)]]
-    boxes = boxes[(boxes[:, 0] < FAR / 2) & (boxes[:, 5] < HEADROOM), :5]
-    posts = posts[(posts[:, 0] < FAR / 2) & (posts[:, 3] < HEADROOM), :3]
+    boxes, posts = blocking(world)
+    boxes, posts = boxes[boxes[:, 0] < FAR / 2, :5], posts[posts[:, 0] < FAR / 2, :3]
     return np.concatenate([boxes, wall_boxes(world)]), posts
 
 
@@ -35,7 +32,7 @@ def collect(worlds: list[World], max_boxes: int, max_posts: int) -> Solids:
     """What stops a robot in each world of a batch (host).
 
     Args:
-        worlds: One world each. What blocks counts, drops included, unless a robot passes under it (`HEADROOM`).
+        worlds: One world each. What blocks counts, drops included, unless a robot passes under it (`world.HEADROOM`).
         max_boxes: How many boxes there may be in a world, a grid's walls included.
         max_posts: How many cylinders.
 

@@ -180,7 +180,7 @@ def from_grid(occupied: np.ndarray, origin: tuple[float, float], resolution: flo
     return make_world(field=field)
 
 
-def _blocking(world: World) -> tuple[np.ndarray, np.ndarray]:
+def blocking(world: World) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the boxes and of the cylinders that stop a robot, float64."""
     boxes, cylinders = np.asarray(world.boxes, np.float64), np.asarray(world.cylinders, np.float64)
     return (
@@ -213,7 +213,7 @@ def rasterise(
     y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
     x, y = x[None, :], y[:, None]
     occupied = np.zeros(shape, bool)
-    boxes, cylinders = _blocking(world)
+    boxes, cylinders = blocking(world)
     for (bx, by, yaw, hx, hy, _, _), at in zip(boxes, _windows(boxes, resolution, origin, shape, resolution), strict=True):
         if at is None:
             continue
@@ -236,7 +236,7 @@ def near_distance(
     x = origin[0] + (np.arange(shape[1]) + 0.5) * resolution
     y = origin[1] + (np.arange(shape[0]) + 0.5) * resolution
     distance = np.full(shape, reach)
-    boxes, cylinders = _blocking(world)
+    boxes, cylinders = blocking(world)
     for name, rows in (("boxes", boxes), ("cylinders", cylinders)):
         for row, at in zip(rows, _windows(rows, reach, origin, shape, resolution), strict=True):
             if at is not None:
@@ -262,7 +262,7 @@ def signed_distance(world: World, points: np.ndarray) -> np.ndarray:
     """
     x, y = np.asarray(points, np.float64).reshape(-1, 2).T
     distance = np.full(len(x), FAR)
-    boxes, cylinders = _blocking(world)
+    boxes, cylinders = blocking(world)
     for bx, by, yaw, hx, hy, _, _ in boxes:
         c, s = np.cos(yaw), np.sin(yaw)
         qx = np.abs(c * (x - bx) + s * (y - by)) - hx
