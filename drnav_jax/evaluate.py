@@ -269,11 +269,22 @@ def _pad_maps(maps: list[GridMap]) -> list[GridMap]:
 
 
 def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = None) -> EpisodeParams:
-    """The batch of episodes `[B, ...]`; `params` overrides the setup's parameters (its predictor's stay)."""
-    params = params_of(setup) if params is None else params
-    each = [
-        params._replace(goal_tolerance=t.goal_tolerance) for t in trips
-    ]
+    """The batch of episodes `[B, ...]`.
+
+    Args:
+        trips: What is driven.
+        setup: Robot, planner, sensors.
+        params: In place of the setup's own, of which they are made (`params_of`).
+
+    Raises:
+        ValueError: If `params` hold those of another predictor.
+    """
+    usual = params_of(setup)
+    params = usual if params is None else params
+    given, needed = (type(p.predictor).__name__ for p in (params, usual))
+    if given != needed:
+        raise ValueError(f"params.predictor is {given}, {setup.predictor} needs {needed}: begin with params_of(setup).")
+    each = [params._replace(goal_tolerance=t.goal_tolerance) for t in trips]
     if setup.evidence == "oracle":
         labels = _pad_maps([label_map(t, setup.robot_radius) for t in trips])
         each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
@@ -286,16 +297,12 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
         world=worlds.stack_worlds(every),
         start=_float32([t.scene.start for t in trips]),
         goal=_float32([t.scene.goal for t in trips]),
-        time_limit=_float32([t.time_limit for t in trips]),
-        goal_tolerance=_float32([t.goal_tolerance for t in trips]),
-        robot=spread(params.robot),
-        policy=_stack(each),
+        time_limit=_float32([t.time_limit for t in trips]), goal_tolerance=_float32([t.goal_tolerance for t in trips]),
+        robot=spread(params.robot), policy=_stack(each), faults=spread(episode.FaultParams()), solids=solids,
         lidar=spread(LidarParams(max_range=setup.lidar_range)),
         camera=spread(CameraParams()) if setup.evidence == "fusion" else (),
-        faults=spread(episode.FaultParams()),
         motors=() if physics is None else spread(mjx.MjxParams()),
-        solids=solids,
-    )
+    )  # fmt: skip
 
 
 class Evaluation(NamedTuple):

@@ -1,6 +1,6 @@
 """Figures of merit of episodes (paper, section V-A; Anderson et al. 2018 for SPL; BARN for its score) and of detection.
 
-efficiency = straight-line distance / distance driven
+efficiency = success * straight-line distance / distance driven
 SPL        = success * shortest / max(shortest, distance driven)
 NPR        = distance moved away from the goal / distance driven
 BARN       = success * T_opt / clip(T, 2 T_opt, 8 T_opt),  T_opt = reference length / 2 m/s

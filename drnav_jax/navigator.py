@@ -24,11 +24,12 @@ from drnav_jax.filter import recovery as recovery_points
 from drnav_jax.filter.recovery import RecoveryParams as RecoveryPointParams
 from drnav_jax.filter.recovery import RecoveryPoints, RecoverySpec
 from drnav_jax.models import geometric
-from drnav_jax.planning import costmap, dynamics, follower, goal_generator, memory, nav2_recovery, route, tracker
+from drnav_jax.planning import costmap, dynamics, follower, goal_generator, latency, memory, nav2_recovery, route, tracker
 from drnav_jax.planning import recovery as behaviour
 from drnav_jax.planning.compositions import Composition
 from drnav_jax.planning.follower import FollowerParams, FollowerSpec, FollowerState
 from drnav_jax.planning.goal_generator import GeneratorSpec, LocalGoal
+from drnav_jax.planning.latency import LatencyParams, LatencyState
 from drnav_jax.planning.memory import MemorySpec, MemoryState
 from drnav_jax.planning.recovery import RecoveryParams, RecoveryState
 from drnav_jax.planning.route import RouteParams, RouteSpec
@@ -77,7 +78,7 @@ class NavSpec:
         shape = self.filter.grid.shape
         if any(n % self.route.pooling for n in shape):
             raise ValueError(f"the window {shape} must be a multiple of route.pooling = {self.route.pooling} cells.")
-        memory.check(self.memory, self.filter.grid)
+        memory.check(self.memory, self.filter.grid, self.route.pooling)
         if self.dt <= 0 or self.replan_every < 1:
             raise ValueError(f"dt must be > 0 s and replan_every >= 1, got {self.dt} and {self.replan_every}.")
         follower.check(self.follower, self.planner, self.dt)
@@ -85,8 +86,14 @@ class NavSpec:
             raise ValueError(f"tracker.dt must be the tick, {self.dt} s, got {self.tracker.dt}.")
         if self.recovery_points.grid != self.filter.grid:
             raise ValueError(f"recovery_points.grid must be the window, {self.filter.grid}.")
-        if not self.planner.controls:
-            object.__setattr__(self, "generator", dataclasses.replace(self.generator, num_speeds=0))
+        around = 0.5 * (self.filter.local_cells - self.filter.grid.stride) * self.filter.grid.resolution
+        if around < 2.0:  # in which the fastest robot stops
+            raise ValueError(f"filter.local_cells leave {around:.1f} m around the robot, 2 m are needed to brake.")
+
+    @property
+    def candidates(self) -> GeneratorSpec:
+        """The generator's sizes as the planner uses them."""
+        return self.generator if self.planner.controls else dataclasses.replace(self.generator, num_speeds=0)
 
 
 class NavParams(NamedTuple):
@@ -100,10 +107,12 @@ class NavParams(NamedTuple):
     recovery: RecoveryParams = RecoveryParams()
     recovery_points: RecoveryPointParams = RecoveryPointParams()
     follower: FollowerParams = FollowerParams()
+    latency: LatencyParams = LatencyParams()
     predictor: Any = geometric.GeometricParams()
     squeeze_time: Scalar = 5.0  # [] how long narrow ways stay allowed after none was found [s]
     hysteresis: Scalar = 0.3  # [] advantage of the last g* [m]
     goal_tolerance: Scalar = 0.75  # [] nearer than this the robot has arrived and stops [m]
+    max_age: Scalar = 0.5  # [] images and scans older than this count as missing [s]
     pose_jump: Scalar = 1.0  # [] the map is dropped when odometry leaps farther than this in one tick [m]
 
 
@@ -119,6 +128,7 @@ class NavState(NamedTuple):
     memory: MemoryState
     recovery: RecoveryState
     follower: FollowerState | None  # of planners that follow a path
+    latency: LatencyState
     local_goal: Array  # [2] the last g* [m]
     last_pose: Array  # [3] the last finite pose
     last_command: Array  # [2] v, omega
@@ -159,6 +169,7 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
         memory=memory.init(spec.memory),
         recovery=behaviour.init(spec.filter.grid, pose[:2]),
         follower=follower.init(spec.follower, spec.planner, params.follower, pose),
+        latency=latency.init(),
         local_goal=pose[:2],
         last_pose=pose,
         last_command=jnp.zeros(2, jnp.float32),
@@ -188,7 +199,7 @@ def _perceive(spec: NavSpec, params: NavParams, state: NavState, seen: Observati
         belief=moved, plan=plan, risk=risk, memory=held, follower=following,
         points=state.points._replace(valid=state.points.valid & ~leap),
         recovery=behaviour.forget(state.recovery, leap)._replace(visits=visits),
-        local_goal=jnp.where(leap, seen.pose[:2], state.local_goal),
+        local_goal=jnp.where(leap, seen.pose[:2], state.local_goal), last_pose=seen.pose,
     )  # fmt: skip
 
 
@@ -200,9 +211,8 @@ def _fine_clearance(spec: NavSpec, params: NavParams, held: FilterState) -> Floa
 def rollout_field(spec: NavSpec, params: NavParams, state: NavState) -> tuple[GridMap, GridMap]:
     """The square around the robot on cells of half the map's edge: clearance [m], and the words that rollouts read."""
     n, (top, left) = spec.filter.local_cells, belief.local_corner(spec.filter)
-    resolution = spec.filter.grid.resolution
-    origin = geometry.window_origin(state.belief.corner, spec.filter.grid)
-    corner = origin + jnp.asarray([left, top], jnp.float32) * resolution
+    grid, resolution = spec.filter.grid, spec.filter.grid.resolution
+    corner = geometry.window_origin(state.belief.corner, grid) + jnp.asarray([left, top], jnp.float32) * resolution
     clear = _fine_clearance(spec, params, state.belief)
     plan = grids.repeat(state.plan[top : top + n, left : left + n], 2)
     words = costmap.pack_clearance(plan, clear)
@@ -219,15 +229,15 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
         evidence = spec.predictor(params.predictor, seen, local)
         everywhere = jnp.ones(grid.shape, bool)  # where it has nothing to say its confidence is 0
         held = grids.once(belief.assimilate(params.filter, held, evidence, everywhere, spec.dt * spec.replan_every))
-        risk = dead_end.footprint(dead_end.risk(params.filter.dead_end, held.dead_end), robot.radius, grid.resolution)
+        above = dead_end.risk(params.filter.dead_end, held.dead_end)
+        risk = dead_end.footprint(above, robot.radius, grid.resolution, half_width=dead_end.half_width(grid.resolution))
     assert local.closed is not None
     clear = costmap.clearance(local.closed, grid.resolution)
     top, left = belief.local_corner(spec.filter)
     near = grids.pool(_fine_clearance(spec, params, state.belief), 2, "max")  # what rollouts will find there
     clear = jax.lax.dynamic_update_slice(clear, near, (top, left))
     goal, points, visits, recover = seen.goal, state.points, state.recovery.visits, state.recovery
-    remembered = state.memory
-    retreating = recover.mode == behaviour.RETREAT
+    remembered, retreating = state.memory, recover.mode == behaviour.RETREAT
     x, y = geometry.cell_centres(grid.shape, local.origin, grid.resolution)
     here = jnp.hypot(x - seen.pose[0], y - seen.pose[1]) < robot.radius + grid.resolution
     room = grids.flood_fill(local.seen & (local.occupancy < 0) & ((clear > robot.radius) | here), here)
@@ -294,7 +304,7 @@ def _replan(spec: NavSpec, params: NavParams, state: NavState, seen: Observation
 def _act(
     spec: NavSpec, params: NavParams, state: NavState, seen: Observation, healthy: Array, leap: Array, key: PRNGKeyArray
 ) -> tuple[NavState, Command, Info]:
-    """g* and the command that tracks it; the recovery's rules; the stop at the goal."""
+    """g* and the command that tracks it; the recovery's rules; the stop at the goal. `seen` is when the command acts."""
     grid, robot, planner = spec.filter.grid, params.robot, spec.planner
     pose, twist, time = seen.pose, seen.twist, state.time
     window = GridMap(state.risk, geometry.window_origin(state.belief.corner, grid), grid.resolution)
@@ -306,9 +316,9 @@ def _act(
     squeeze = (time < state.squeeze_until) | (recover.mode == behaviour.RETREAT)
     margin = params.score.margin
     score = params.score._replace(margin=jnp.where(squeeze, jnp.minimum(params.route.squeeze_margin, margin), margin))
-    choice = goal_generator.given(spec.generator, seen.goal)
+    choice = goal_generator.given(spec.candidates, seen.goal)
     make = lambda: goal_generator.generate(  # noqa: E731
-        spec.generator, score, robot, field, pose, twist, heading_for, state.local_goal,
+        spec.candidates, score, robot, field, pose, twist, heading_for, state.local_goal,
         jnp.asarray(params.hysteresis, jnp.float32),
     )  # fmt: skip
     if planner.generates:
@@ -319,11 +329,11 @@ def _act(
         risky = jnp.asarray(False)
         if planner.exposure and not planner.risk_in_route:  # a route that prices risk turns away by itself
             inside = geometry.sample_nearest(window, pose[:2]) > 0.5
-            risky = (choice.exposure > params.recovery.risky_exposure) & ~inside
-        driven = jnp.abs(twist[0]) * spec.dt
+            risky = (choice.exposure > params.recovery.risky_exposure) & (params.score.risk_weight > 0) & ~inside
+        driven = jnp.abs(state.latency.twist[0]) * spec.dt
         recover = behaviour.update(
-            grid, params.recovery, recover, time, spec.dt, pose[:2], driven, window.origin, choice.valid, state.reachable,
-            risky, choice.xy,
+            grid, params.recovery, recover, time, spec.dt, state.last_pose[:2], driven, window.origin, choice.valid,
+            state.reachable, risky, choice.xy,
         )  # fmt: skip
     following: Any = state.follower
     seek_room = recover.mode == behaviour.CLEAR
@@ -339,7 +349,7 @@ def _act(
     if planner.recovery == "nav2":
         waiting = arrived | ~healthy
         following, track, wipe = follower.recover(
-            params.follower, robot, following, local, track, pose, twist, time, waiting, spec.dt
+            params.follower, robot, following, local, track, state.last_pose, twist, time, waiting, spec.dt
         )
         held = belief.forget(spec.filter, held, pose[:2], jnp.where(wipe, params.follower.recovery.clear_radius, -1.0))
         mode, entries = nav2_recovery.as_drnav(following.recovery.mode), following.recovery.retries
@@ -347,24 +357,15 @@ def _act(
     stop = dynamics.limit(0.0, 0.0, twist, robot, spec.dt)
     command = jax.tree.map(lambda a, b: jnp.where(halt, a, b), stop, track.command)
     info = Info(
-        local_goal=choice,
-        track=track,
-        mode=mode,
-        arrived=arrived,
-        recoveries=entries,
+        local_goal=choice, track=track, mode=mode, arrived=arrived, recoveries=entries,
         p_dead=dead_end.probability(geometry.sample_nearest(window._replace(values=held.dead_end), pose[:2])),
         clearance=geometry.sample_bilinear(local, pose[:2]),
         fault=~healthy | leap | ~jnp.any(seen.point_valid),
-    )
+    )  # fmt: skip
     state = state._replace(
-        belief=held,
-        recovery=recover,
-        follower=following,
-        local_goal=choice.xy,
-        last_pose=pose,
-        last_command=jnp.stack([command.v, command.omega]),
-        time=time + spec.dt,
-    )
+        belief=held, recovery=recover, follower=following, local_goal=choice.xy,
+        latency=latency.sent(state.latency, command), last_command=jnp.stack(command), time=time + spec.dt,
+    )  # fmt: skip
     return state, command, info
 
 
@@ -378,7 +379,8 @@ def step(
         spec: Sizes and composition (static).
         params: Parameters; sweep them without compiling again.
         state: What the robot carried over.
-        observation: What its sensors say now; missing sensors are masked, non-finite values count as missing.
+        observation: What its sensors say now; missing sensors are masked, non-finite values count as missing. Its speeds
+            also tell how late commands act (`planning.latency`).
         key: Randomness (only MPPI uses any).
         replan: Also update the dead-end belief, the cost-to-go and the recovery points; every
             `spec.replan_every`-th tick, the first included (static).
@@ -386,9 +388,11 @@ def step(
     Returns:
         The new state, the command (finite, within speed and acceleration limits) and what one looks at.
     """
-    seen, healthy = sane(observation, state.last_pose, state.last_command)
+    seen, healthy = sane(observation, state.last_pose, state.last_command, params.max_age)
     leap = jnp.hypot(seen.pose[0] - state.last_pose[0], seen.pose[1] - state.last_pose[1]) > params.pose_jump
     state = _perceive(spec, params, state, seen, leap)
     if replan:
         state = _replan(spec, params, state, seen)
-    return _act(spec, params, state, seen, healthy, leap, key)
+    late = latency.update(params.latency, state.latency, seen.twist, params.robot, spec.dt)
+    pose, twist = latency.ahead(late, seen.pose, seen.twist, params.robot, spec.dt)  # when this command acts
+    return _act(spec, params, state._replace(latency=late), seen._replace(pose=pose, twist=twist), healthy, leap, key)

@@ -181,7 +181,7 @@ class Observation(NamedTuple):
     pose: Array  # [3] x, y, yaw in odom
     twist: Array  # [2] measured v [m/s], omega [rad/s]
     goal: Array  # [2] x, y in odom [m]
-    image_age: Array  # [N] time since capture [s]
+    image_age: Array  # [N] time since capture [s]; what is too old counts as missing (`NavParams.max_age`)
     point_age: Array  # [] time since the scan [s]
     rig: CameraRig  # where the cameras sit and look
 
@@ -217,7 +217,7 @@ def empty_observation(num_points: int, rig: RigSpec = NO_CAMERAS) -> Observation
 
 
 def sane(
-    seen: Observation, pose: Float[Array, "3"], twist: Float[Array, "2"]
+    seen: Observation, pose: Float[Array, "3"], twist: Float[Array, "2"], max_age: Scalar
 ) -> tuple[Observation, Bool[Array, ""]]:
     """An observation without broken values, and whether its pose can be used.
 
@@ -225,11 +225,12 @@ def sane(
         seen: As it came; what is not finite counts as missing.
         pose: What stands in for a broken pose; then no point is valid, since nobody knows where it is.
         twist: What stands in for broken speeds.
+        max_age: Images and scans older than this count as missing [s].
     """
     pose_ok = jnp.all(jnp.isfinite(seen.pose))
     pose = jnp.where(pose_ok, seen.pose, pose)
-    valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok
-    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3))
+    valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok & (seen.point_age <= max_age)
+    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3)) & (seen.image_age <= max_age)
     return seen._replace(
         pose=pose,
         twist=jnp.where(jnp.all(jnp.isfinite(seen.twist)), seen.twist, twist),

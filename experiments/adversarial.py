@@ -6,7 +6,7 @@ Each case is a small world with a trip, a fault of the body, or both; the robot 
 command nothing that is not a number or beyond what it can do, and not go on for ever: at the end it is at the goal, or it
 stands still and says so (mode "stop", or that it has arrived, for the last `STILL` seconds). A robot whose odometry drifts
 arrives where it takes the goal to be: off by no more than the drift of its way. A command is beyond the limits if it is
-outside the robot's speeds, or farther from the measured speeds than its accelerations allow for within a tick.
+outside the robot's speeds, or farther from those that it meets when it acts than accelerations allow for within a tick.
 """
 
 import dataclasses
@@ -172,25 +172,23 @@ def trip_of(name: str, case: Case, limit: float) -> Trip:
     return Trip(scene, math.nan, np.zeros((0, 2)), limit, TOLERANCE)
 
 
-def motors(commands: np.ndarray, delay: float, robot: RobotParams, dt: float) -> np.ndarray:
-    """Measured speeds `[T, 2]` before each of the commands, as `sim.kinematic` has it."""
-    late = round(delay / dt)
-    reached = np.concatenate([np.zeros((late, 2)), commands])[: len(commands)]
+def motors(commands: np.ndarray, robot: RobotParams, dt: float) -> np.ndarray:
+    """Speeds `[T, 2]` that each of the commands meets when it acts, however late that is, as `sim.kinematic` has it."""
     low, high = np.array([robot.v_min, -robot.w_max]), np.array([robot.v_max, robot.w_max])
     rate = np.array([robot.a_max, robot.alpha_max]) * dt
     speeds = [np.zeros(2)]
-    for wanted in reached:
+    for wanted in commands:
         speeds.append(np.clip(np.clip(wanted, low, high), speeds[-1] - rate, speeds[-1] + rate))
     return np.array(speeds[:-1])
 
 
-def beyond(commands: np.ndarray, delay: float, robot: RobotParams, dt: float, tiny: float = 1e-4) -> int:
+def beyond(commands: np.ndarray, robot: RobotParams, dt: float, tiny: float = 1e-4) -> int:
     """How many commands are not numbers, or beyond the limits (module docstring)."""
     low, high = np.array([robot.v_min, -robot.w_max]), np.array([robot.v_max, robot.w_max])
     rate = np.array([robot.a_max, robot.alpha_max]) * dt
     finite = np.asarray(np.isfinite(commands).all(axis=1))
     known = np.where(finite[:, None], commands, 0.0)
-    far = np.abs(known - motors(known, delay, robot, dt)) > rate + tiny
+    far = np.abs(known - motors(known, robot, dt)) > rate + tiny
     wrong = ~finite | (known < low - tiny).any(axis=1) | (known > high + tiny).any(axis=1) | far.any(axis=1)
     return int(wrong.sum())
 
@@ -205,7 +203,7 @@ def judged(case: Case, result: episode.Result, k: int) -> dict[str, Any]:
     arrived = log.policy["arrived"][-last:].all()
     stands = np.abs(log.command[-last:]).max() < 1e-3 and (arrived or (log.policy["mode"][-last:] == recovery.STOP).all())
     modes = np.bincount(log.policy["mode"], minlength=len(recovery.MODES)) * dt
-    wrong = beyond(log.command.astype(float), float(case.faults.delay), RobotParams(radius=RADIUS), dt)
+    wrong = beyond(log.command.astype(float), RobotParams(radius=RADIUS), dt)
     return {
         "success": success, "collision": collision, "stopped": bool(stands and not success and not collision),
         "says_arrived": bool(arrived), "off_m": round(math.dist(case.goal, log.pose[-1, :2]), 2),

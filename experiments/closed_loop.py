@@ -69,7 +69,15 @@ class Config:
         """Check names and ranges."""
         if self.trips < 1 or self.watched < 0 or not self.rows or not self.groups:
             raise ValueError("trips must be >= 1, watched >= 0, and there must be rows and groups.")
+        if self.split not in worlds.SPLITS:
+            raise ValueError(f'split must be one of {", ".join(worlds.SPLITS)}, got "{self.split}".')
+        if self.weights is not None and not self.weights.is_file():
+            raise ValueError(f"{self.weights} is no file of weights.")
         for group in self.groups:
+            range_of(group)
+            named = group.rpartition("@")[0]
+            if not Path(named).is_file() and (other := [f for f in named.split("+") if f not in worlds.FAMILIES]):
+                raise ValueError(f'"{", ".join(other)}" of the group {group} is neither a family of worlds nor a file.')
             for row in self.rows:
                 setup_of(self, row, range_of(group))
 

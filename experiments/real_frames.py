@@ -36,7 +36,6 @@ from drnav_jax.scripts import script
 from drnav_jax.types import LocalMap, Observation
 
 WAYS = ("front", "left", "right")
-CREDIT = "KITTI raw data, drive 2011_09_26 (Geiger, Lenz, Stiller, Urtasun 2013), CC BY-NC-SA 3.0"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,30 +46,36 @@ class Config:
         data: The bag: a folder with metadata.yaml, or a `.bag` file.
         out: Folder for pictures and figures.
         weights: Of the network; None = those that come with the package.
+        images: Topics of the cameras; none named = all there are.
+        points: Topic of the LiDAR, if there are several.
         base_frame: The frame that stands for base_link.
         base_height: Its origin above the ground, about [m]: the ground is looked for there.
+        level: Find the ground in each cloud; without (a 2-D LiDAR's scans have none) it lies `base_height` below.
         body: Points nearer than this are the vehicle itself [m].
         shape: (h, w) of the images that the network is given [pixels].
         fov: Their horizontal field of view [degrees].
         frames: At most so many, evenly spread; 0 = all.
         columns: Of the contact sheet.
         repeats: Answers per frame that are timed.
-        note: Line at the foot of the sheet.
+        note: Line at the foot of the sheet, such as whose recording it is.
         json: Print one JSON object on stdout, and nothing else there.
     """
 
     data: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")] = Path("results") / "real_frames"
     weights: Path | None = None
+    images: tuple[str, ...] = ()
+    points: str | None = None
     base_frame: str = "velodyne"
     base_height: float = 1.73
+    level: bool = True
     body: float = 2.0
     shape: tuple[int, int] = (96, 96)
     fov: float = 90.0
     frames: int = 16
     columns: int = 4
     repeats: int = 10
-    note: str = CREDIT
+    note: str = ""
     json: bool = False
 
     def __post_init__(self) -> None:
@@ -118,7 +123,8 @@ def asked(spec: NetworkSpec, params: FusionParams, seen: Observation, local: Loc
 def spec_of(config: Config) -> bags.BagSpec:
     """How the bag is read."""
     return bags.BagSpec(
-        base_frame=config.base_frame, base_height=config.base_height, level=True,
+        images=config.images or None, points=config.points, odometry="",  # each frame stands for itself
+        base_frame=config.base_frame, base_height=config.base_height, level=config.level,
         image=bags.ImageSpec(config.shape, math.radians(config.fov)), scan=bags.ScanSpec(min_range=config.body),
     )  # fmt: skip
 

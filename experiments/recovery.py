@@ -123,7 +123,8 @@ def gathered(config: Config) -> list[Trapped]:
     """The trips, families in turn."""
     found: list[Trapped] = []
     for k in range(50 * config.trips):
-        one = trapped(config, config.families[k % len(config.families)], k // len(config.families), config.out / "truth")
+        turn, place = divmod(k, len(config.families))
+        one = trapped(config, config.families[place], config.seed + turn, config.out / "truth")
         if one is not None:
             found.append(one)
         if len(found) == config.trips:

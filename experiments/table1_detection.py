@@ -98,6 +98,8 @@ class Config:
             raise ValueError(f"--loss-frames must be a multiple of {CHUNK} and <= --frames, got {self.loss_frames}.")
         if not (1 <= self.vlm_frames and 1 <= self.pictured):
             raise ValueError("--vlm-frames and --pictured must be >= 1.")
+        if self.weights is not None and not self.weights.is_file():
+            raise ValueError(f"{self.weights} is no file of weights.")
 
 
 def gathered(

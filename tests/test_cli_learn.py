@@ -43,8 +43,20 @@ def test_mistakes(capsys, tmp_path):
 
 def gathered(folder, count, seed):
     spec = DatasetSpec(count, "train", seed, ("t", "u", "l"), num_worlds=8, per_world=-(-count // 8))
-    write(folder, spec, {}, lambda shard: frames(spec.shard_size, seed + shard))
+    held = {"frames": {"bev": settings.plain(LEAST.bev)}}
+    write(folder, spec, held, lambda shard: frames(spec.shard_size, seed + shard))
     return folder
+
+
+def test_sets_on_another_grid(capsys, tmp_path):
+    data, held_out, out = gathered(tmp_path / "data", 32, 0), gathered(tmp_path / "val", 64, 1), tmp_path / "run"
+    config = {"network": settings.plain(LEAST) | {"bev": settings.plain(LEAST.bev) | {"ahead": 0.3}}}
+    file = other(tmp_path, config)
+    error = said(capsys, "--out", out, "--data", data, "--validation", held_out, "--config", file)
+    assert f"{data} was gathered on the grid" in error and "'ahead': 0.3" in error
+    error = said(capsys, "--out", out, "--stream", "--validation", held_out, "--config", file)
+    assert f"{held_out} was gathered on the grid" in error
+    assert not out.exists(), "nothing was begun"
 
 
 def test_sets_that_are_too_small(capsys, tmp_path):

@@ -35,6 +35,14 @@ def test_the_risk_weight_reaches_all_who_price_risk():
     assert [params.score.risk_weight, params.route.risk_weight, params.follower.critics.exposure.weight] == [0.5] * 3
 
 
+@pytest.mark.parametrize("predictor", ["none", "oracle"])
+def test_parameters_of_another_predictor_are_refused(predictor):
+    (trip,) = evaluate.prepare([worlds.sample("u", 0)], evaluate.Setup())
+    setup = evaluate.Setup(predictor=predictor)
+    with pytest.raises(ValueError, match=f"GeometricParams, {predictor} needs"):
+        evaluate.episode_params([trip], setup, evaluate.NavParams())
+
+
 def test_the_simulation_keeps_the_robots_time():
     (trip,) = evaluate.prepare([worlds.sample("u", 0)], evaluate.Setup())
     with pytest.raises(ValueError, match="must be the robot's"):

@@ -391,7 +391,8 @@ def test_every_planner_fits_together(planner):
         names, why = follower.critics(spec.follower, spec.planner), info.track.critics
         assert why.chosen.shape == (len(names),) and why.best.shape == (10, len(names))
         assert info.local_goal.best_score.shape == info.local_goal.best.progress.shape == (10,)
-    assert spec.generator.num_candidates == (34 if not spec.planner.controls else 55)
+    assert spec.candidates.num_candidates == (34 if not spec.planner.controls else 55)
+    assert dataclasses.replace(spec, planner=PLANNERS["drnav"]) == dataclasses.replace(SPEC, planner=PLANNERS["drnav"])
 
 
 @pytest.mark.parametrize(
@@ -402,6 +403,8 @@ def test_every_planner_fits_together(planner):
         ({"dt": 0.05}, "tracker.dt must be the tick, 0.05 s, got 0.1"),
         ({"planner": PLANNERS["mppi"], "dt": 0.05}, "MPPI's step must be the tick, 0.05 s: follower.mppi.dt is 0.1"),
         ({"recovery_points": RecoverySpec()}, "recovery_points.grid must be the window"),
+        ({"filter": FilterSpec(grid=GRID, local_cells=40)}, "leave 1.6 m around the robot, 2 m are needed"),
+        ({"memory": MemorySpec(cells=256, pooling=1)}, "memory pooling 1 must be a multiple of the route's, 2"),
     ],
 )
 def test_the_spec_is_checked(wrong, message):

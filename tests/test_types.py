@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from drnav_jax.types import FRONT_LEFT_RIGHT, BevSpec, GridSpec, Mount, RigSpec, empty_observation, rig_of
+from drnav_jax.types import FRONT_LEFT_RIGHT, BevSpec, GridSpec, Mount, RigSpec, empty_observation, rig_of, sane
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,16 @@ def test_an_empty_observation_is_all_masks():
     assert empty_observation(0).points.shape == (0, 3)
     with pytest.raises(ValueError, match="num_points must be >= 0"):
         empty_observation(-1)
+
+
+def test_what_is_too_old_is_missing():
+    seen = empty_observation(2, RigSpec())
+    seen = seen._replace(image_valid=jnp.ones(3, bool), point_valid=jnp.ones(2, bool))
+    for ages, point_age, want in (([0, 0.5, 0.6], 0.5, [1, 1, 0]), ([0, jnp.nan, jnp.inf], 0.51, [1, 0, 0])):
+        aged = seen._replace(image_age=jnp.asarray(ages, jnp.float32), point_age=jnp.float32(point_age))
+        kept, healthy = sane(aged, seen.pose, seen.twist, 0.5)
+        assert bool(healthy) and kept.image_valid.tolist() == [bool(w) for w in want]
+        assert kept.point_valid.tolist() == [point_age <= 0.5] * 2
 
 
 def test_a_rig_looks_where_its_mounts_say():

@@ -32,7 +32,7 @@ class BagSpec:
         images: Topics of the N cameras, raw or compressed; None = all there are. `CameraInfo` comes from the topic
             camera_info beside each.
         points: Topic of the LiDAR, PointCloud2 or LaserScan; None = the only one.
-        odometry: Topic; None = the only one.
+        odometry: Topic; None = the only one; "" = it is not read.
         base_frame: The frame that stands for base_link.
         base_height: Its origin above the ground [m].
         level: Find the ground in each cloud and take it for z = 0 (`scan.level`).
@@ -95,7 +95,7 @@ def _sensors(bag: Bag, spec: BagSpec) -> _Sensors:
     """
     images = _image_topics(bag, spec.images)
     points = chosen(bag, spec.points, (scan.CLOUD, scan.LASER), "LiDAR")
-    odometry = chosen(bag, spec.odometry, (ODOMETRY,), "odometry")
+    odometry = None if spec.odometry == "" else chosen(bag, spec.odometry, (ODOMETRY,), "odometry")
     seeing = (*images, *([points] if points else []))
     if not seeing:
         raise ValueError(f"{bag.path} has neither images nor a point cloud or laser scan; it has {listing(bag)}.")

@@ -7,6 +7,7 @@ from drnav_jax import dataset, report, train
 from drnav_jax.cli import process
 from drnav_jax.cli.flags import Train
 from drnav_jax.cli.terminal import Bar, stdout_kept
+from drnav_jax.models import settings
 from drnav_jax.models.batch import Batch, batch_of
 from drnav_jax.scripts import INTERRUPTED
 
@@ -21,12 +22,27 @@ def _validation(args: Train) -> list[Batch]:
     return [batch_of(f._asdict()) for f in dataset.batches(args.validation, CHUNK, 0, epochs=1, workers=0)]
 
 
-def _about(args: Train) -> dict[str, dict[str, Any]]:
+def _about(args: Train, endless: dataset.DatasetSpec) -> dict[str, dict[str, Any]]:
     """What the sets are, for the notes beside the weights."""
     folders = {f"train{k or ''}": folder for k, folder in enumerate(args.data)} | {"validation": args.validation}
     told = ("split", "seed", "num_frames", "families", "litter", "charted")
     specs = {name: dataset.read_manifest(folder)["spec"] for name, folder in folders.items()}
+    if args.stream:
+        specs["train"] = settings.plain(endless) | {"num_frames": "without end"}
     return {name: {key: spec[key] for key in told if key in spec} for name, spec in specs.items()}
+
+
+def _check_grid(args: Train, spec: train.TrainSpec) -> None:
+    """The network's grid must be that of the sets: their maps and labels are cut out already.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    ours = settings.plain(spec.network.bev)
+    for folder in (*args.data, args.validation):
+        theirs = dataset.read_manifest(folder)["settings"].get("frames", {}).get("bev")
+        if theirs != ours:
+            raise ValueError(f"{folder} was gathered on the grid {theirs}, the network has {ours} (bev): make them one.")
 
 
 def perform(args: Train) -> int:
@@ -40,15 +56,16 @@ def perform(args: Train) -> int:
         raise ValueError("give either --data DIR or --stream.")
     spec = train.read(args.config)
     process.use_every_core()
-    validation = _validation(args)
+    validation, endless = _validation(args), dataset.spec_of(1, "train", spec.seed)
     if args.data:
         count = len(dataset.FrameSource(*args.data))  # mistakes come before --out is begun
         if count < spec.batch_size:
             raise ValueError(f"{', '.join(map(str, args.data))} holds {count} frames: a batch has {spec.batch_size}.")
         source = lambda first: dataset.batches(args.data, spec.batch_size, spec.seed, first=first)  # noqa: E731
     else:
-        worlds = dataset.spec_of(1, "train", spec.seed)
-        source = lambda first: dataset.stream(spec.batch_size, worlds, first=first)  # noqa: E731
+        frames = dataset.FrameSpec(bev=spec.network.bev)
+        source = lambda first: dataset.stream(spec.batch_size, endless, frames, first=first)  # noqa: E731
+    _check_grid(args, spec)
     begun: int | None = None
     bar = Bar("train", spec.steps, "steps")
     try:
@@ -60,7 +77,7 @@ def perform(args: Train) -> int:
                 bar(step, step - begun, note=_note(figures))
 
             result = train.train(
-                spec, source, validation, args.out, resume=args.resume, progress=said, data=_about(args)
+                spec, source, validation, args.out, resume=args.resume, progress=said, data=_about(args, endless)
             )
     except KeyboardInterrupt:
         print(f"drnav: interrupted; the same command with --resume goes on in {args.out}/", file=sys.stderr)

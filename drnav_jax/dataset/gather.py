@@ -17,7 +17,7 @@ from drnav_jax.dataset import collect, routes
 from drnav_jax.dataset.behaviours import KINDS
 from drnav_jax.dataset.collect import Sensors
 from drnav_jax.dataset.frames import STRATUM_BITS, Frame, FrameSpec
-from drnav_jax.dataset.shards import DatasetSpec, pairs
+from drnav_jax.dataset.shards import DatasetSpec, checked, pairs
 from drnav_jax.sim import CameraParams, mjx
 from drnav_jax.sim.lidar import LidarParams
 from drnav_jax.types import Mount, RigSpec, RobotParams, rig_of
@@ -122,7 +122,8 @@ def shard(data: DatasetSpec, spec: FrameSpec, number: int) -> Frame:
         seen = strata.in_view(scene, np.asarray(sensed["pose"], np.float64))
         about["strata_seen"] = seen @ np.array(list(STRATUM_BITS.values()))
         parts.append(_joined(spec, jax.device_get(sensed), truths[k // 2][k % 2], inner, about))
-    return Frame(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+    whole = Frame(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+    return Frame(**checked(whole, data.shard_size))
 
 
 def _padded(world: World) -> World:

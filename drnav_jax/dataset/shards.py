@@ -2,7 +2,7 @@
 
     DIR/plan.json               what is being written; made first
     DIR/shard-00000.safetensors fields of `Frame`, `[frames, ...]`; written under another name, then renamed
-    DIR/manifest.json           hashes, sizes, counts, versions; made last, so that its presence says "complete"
+    DIR/manifest.json           hashes, sizes, counts, the format; made last, so that its presence says "complete"
 
 A shard depends on the plan and its number only. What is found complete is kept, what is missing is made, so an
 interrupted run goes on where it was and ends in the same bytes.
@@ -25,6 +25,8 @@ from drnav_jax.dataset.frames import Frame, dtypes
 from drnav_jax.worlds import SPLITS
 
 FORMAT = 1  # of the files; raise it when a field changes
+APART = 1_000_000  # between the world seeds of one dataset and the next
+MAX_SEED = 2146  # so that world seeds fit in 32 bits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,9 +57,9 @@ class DatasetSpec:
 
     def __post_init__(self) -> None:
         """Check ranges."""
-        if min(self.num_frames, self.ticks, self.per_world) < 1 or self.seed < 0:
+        if min(self.num_frames, self.ticks, self.per_world) < 1 or not 0 <= self.seed <= MAX_SEED:
             raise ValueError(
-                "num_frames, ticks and per_world must be >= 1 and seed >= 0, got "
+                f"num_frames, ticks and per_world must be >= 1 and seed within 0..{MAX_SEED}, got "
                 f"{self.num_frames}, {self.ticks}, {self.per_world} and {self.seed}."
             )
         if min(self.litter, self.charted) < 0 or not self.litter + self.charted <= 1:
@@ -95,7 +97,7 @@ def pairs(spec: DatasetSpec, shard: int) -> list[tuple[str, int, str]]:
         turn, place = divmod(n, len(spec.families))
         order = np.random.default_rng(np.random.SeedSequence([spec.seed, turn])).permutation(len(spec.families))
         kind = KINDS[(n % per_shard) // (per_shard // len(KINDS))]
-        found.append((spec.families[order[place]], spec.seed * 1_000_000 + n, kind))
+        found.append((spec.families[order[place]], spec.seed * APART + n, kind))
     return found
 
 
@@ -145,7 +147,7 @@ def write(
     Args:
         out: Folder; made if need be.
         spec: What to write.
-        settings: What else the content depends on (sensors, versions); JSON values.
+        settings: What else the content depends on (sensors); JSON values.
         make: Number of a shard -> all of its frames (a short last shard is cut off here).
         workers: Shards made side by side; the content does not depend on it.
         pool: Number of workers -> what they are; processes must be able to pickle `make`.

@@ -5,8 +5,9 @@ batch s holds is a function of the seed and of s.
 """
 
 import dataclasses
+import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import numpy as np
 
@@ -36,21 +37,29 @@ def stream(
     per_round = TOGETHER * data.shard_size // batch_size
     endless = dataclasses.replace(data, num_frames=max(data.num_frames, data.shard_size))
 
-    def made(number: int) -> Frame:
-        parts = [gather.shard(endless, spec, number * TOGETHER + k) for k in range(TOGETHER)]
+    def made(number: int, left: threading.Event) -> Frame:
+        parts = []
+        for k in range(TOGETHER):
+            if left.is_set():  # nobody reads what would be made
+                raise CancelledError
+            parts.append(gather.shard(endless, spec, number * TOGETHER + k))
         return Frame(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
     def batches() -> Iterator[Frame]:
         number, skip = divmod(first, per_round)
+        left = threading.Event()
         with ThreadPoolExecutor(1) as pool:
-            ahead = pool.submit(made, number)
-            while True:
-                frames, ahead = ahead.result(), pool.submit(made, number + 1)
-                rng = np.random.default_rng(np.random.SeedSequence([data.seed, number]))
-                order = rng.permutation(TOGETHER * data.shard_size)
-                for k in range(skip, per_round):
-                    chosen = order[k * batch_size : (k + 1) * batch_size]
-                    yield Frame(*(np.asarray(field)[chosen] for field in frames))
-                number, skip = number + 1, 0
+            try:
+                ahead = pool.submit(made, number, left)
+                while True:
+                    frames, ahead = ahead.result(), pool.submit(made, number + 1, left)
+                    rng = np.random.default_rng(np.random.SeedSequence([data.seed, number]))
+                    order = rng.permutation(TOGETHER * data.shard_size)
+                    for k in range(skip, per_round):
+                        chosen = order[k * batch_size : (k + 1) * batch_size]
+                        yield Frame(*(np.asarray(field)[chosen] for field in frames))
+                    number, skip = number + 1, 0
+            finally:
+                left.set()  # the shard that is being made is waited for, no other
 
     return batches()

@@ -36,6 +36,7 @@ from jaxtyping import Array, Bool, Float
 from drnav_jax.types import Evidence, Scalar
 
 _P_MIN = 1e-4  # p^ is kept in (1e-4, 1 - 1e-4), so that no single frame is certain
+WIDEST = 0.35  # [m] radius up to which a footprint is exact to half a cell
 _SUBSAMPLES = 4  # per axis and cell, when a polygon is rasterised
 
 
@@ -182,6 +183,11 @@ def aggregate(values: Float[Array, "H W"], kernel: Float[Array, "n n"], fill: Sc
         for b in range(n):
             total += kernel[a, b] * jax.lax.slice(padded, (a, b), (a + h, b + w))
     return total
+
+
+def half_width(resolution: float) -> int:
+    """Half width [cells] of the kernel that holds a robot of `WIDEST` on cells of this edge [m]."""
+    return max(1, round(WIDEST / resolution))
 
 
 @partial(jax.jit, static_argnames="half_width")

@@ -29,7 +29,7 @@ class Calibration(NamedTuple):
     path: Temperature = Temperature()
     flag: Temperature = Temperature()
     dead: Temperature = Temperature()
-    traversable: Temperature = Temperature()
+    traversable: Temperature = Temperature()  # training leaves it: what reads it has thresholds of its own
 
 
 def probability(temperature: Temperature, logits: Float[Array, "*s"]) -> Float[Array, "*s"]:

@@ -4,7 +4,7 @@ The network answers on a grid that turns with the robot; its answer is brought i
 cell's answer weighs:
 
     (1)  confidence(c) = weight · m(twist) · w(c)
-    (2)  w = 1 where a sensor has seen the cell free, `unseen` where it has not but has seen one within `NEAR`, else 0
+    (2)  w = 1 where a sensor has seen the cell free, `unseen` where it has seen one within `NEAR` along x and y, else 0
     (3)  m = 1 while the robot moves or turns, down to `still` when it stands: the same view twice is no second opinion
 
 `weight` < 1 since successive frames are not independent either: it tempers the filter's sum (eq. 5 of the paper). And since

@@ -4,6 +4,10 @@ A known free cell is a dead end if from it no walk over known free cells reaches
 window's edge or the goal without passing the robot: whatever lies behind the robot is cut off by its own body. For
 other cells the rule only says that they are not shown to be one, which is weak evidence for being open, and none at all
 where little has been seen. It works on cells of twice the map's size, in the configuration space of a disc.
+
+It reads the accumulated map and answers as if each replan were news: the belief adds its small p̂ up (eq. 5), so that what
+it calls shut only for a moment passes, and what it calls shut three times running, 1 s, is believed at 0.9. P_dead then
+tells how long the rule has held, and is no calibrated probability.
 """
 
 from functools import partial
@@ -17,7 +21,6 @@ from drnav_jax import geometry, grids
 from drnav_jax.types import Evidence, LocalMap, Observation, Scalar
 
 _POOLING = 2  # map cells per cell of the rule
-_REACH = 1.0  # [m] clearance is not asked for beyond this
 
 
 class GeometricParams(NamedTuple):

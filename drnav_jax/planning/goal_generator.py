@@ -96,10 +96,11 @@ def candidates(
     )
     span = jnp.sqrt(jnp.sum(targets * targets, axis=-1))
     reach = jnp.concatenate([jnp.full(fan, jnp.float32(1.0)) * params.range_max, span])
-    # a heading is a ray: it is walked at the pace that covers range_max within the horizon
-    pace = jnp.full(spec.num_headings, jnp.float32(1.0)) * params.range_max / params.horizon
-    ends = jnp.minimum(reach, params.range_max)
-    pace = jnp.where(jnp.arange(spec.num_headings) >= fan, ends / params.horizon, pace)
+    # a heading is a ray: it is walked at the pace that covers range_max within the horizon, though in no longer steps than
+    # see any wall: what would hit lies within the radius and the margin of both its sides
+    widest = 1.5 * (robot.radius + params.margin) / spec.dt
+    ends = jnp.where(jnp.arange(spec.num_headings) < fan, params.range_max, jnp.minimum(reach, params.range_max))
+    pace = jnp.minimum(ends / params.horizon, widest)
     # near the last g* there is nothing left to hold on to, or the robot would settle there
     held = hysteresis * jnp.square(jnp.clip(span[0] / params.range_min, 0.0, 1.0))
     here = dynamics.start(pose, twist, controls)

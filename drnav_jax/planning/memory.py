@@ -48,16 +48,20 @@ class MemoryState(NamedTuple):
     north: Array  # [M, M] bool, joined to the cell at higher y
     value: Array  # [M, M] value-to-go [m]
     age: Array  # [] int32, replans since the value was solved
+    goal: Array  # [2] for which it was solved [m]
 
 
 def init(spec: MemorySpec) -> MemoryState:
     """Nothing known: all free."""
     free = jnp.ones((spec.cells, spec.cells), bool)
-    return MemoryState(free, free, free, jnp.zeros(free.shape, jnp.float32), jnp.zeros((), jnp.int32))
+    zero = jnp.zeros(free.shape, jnp.float32)
+    return MemoryState(free, free, free, zero, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32))
 
 
-def check(spec: MemorySpec, grid: GridSpec) -> None:
-    """Raise a ValueError if the memory does not fit around the window."""
+def check(spec: MemorySpec, grid: GridSpec, pooling: int) -> None:
+    """Raise a ValueError if the memory does not fit around the window, or a route `pooling` map cells wide into it."""
+    if spec.pooling % pooling:
+        raise ValueError(f"memory pooling {spec.pooling} must be a multiple of the route's, {pooling}.")
     if grid.stride % spec.pooling or any(n % (2 * spec.pooling) for n in grid.shape):
         raise ValueError(
             f"memory pooling {spec.pooling} must divide the window's stride {grid.stride} and half its shape {grid.shape}."
@@ -72,7 +76,7 @@ def shift(spec: MemorySpec, state: MemoryState, by: Int[Array, "2"]) -> MemorySt
     move = lambda a, fill: geometry.shift(a, by, fill)  # noqa: E731
     return MemoryState(
         free=move(state.free, True), east=move(state.east, True), north=move(state.north, True),
-        value=move(state.value, grids.UNREACHABLE), age=state.age + spec.solve_every,
+        value=move(state.value, grids.UNREACHABLE), age=state.age + spec.solve_every, goal=state.goal,
     )  # fmt: skip
 
 
@@ -85,7 +89,7 @@ def update(
     resolution: float,
     goal: Float[Array, "2"],
 ) -> MemoryState:
-    """Write the window into the memory and, when due, solve for the value-to-go.
+    """Write the window into the memory and, when due or for a new goal, solve for the value-to-go.
 
     Args:
         spec: Sizes.
@@ -110,6 +114,7 @@ def update(
         north=put(state.north, jnp.where(rim_north, old[1], north)),
         value=state.value,
         age=state.age + 1,
+        goal=state.goal,
     )
     size = resolution * by
     begin = origin - jnp.asarray([corner[1], corner[0]], jnp.float32) * size
@@ -126,9 +131,9 @@ def update(
         value = grids.cost_to_go(cost, initial, resolution=size, east=kept.east, north=kept.north)
         return value, jnp.zeros((), jnp.int32)
 
-    due = (kept.age >= spec.solve_every) | (state.age == 0) & jnp.all(state.value == 0)
+    due = (kept.age >= spec.solve_every) | (state.age == 0) & jnp.all(state.value == 0) | jnp.any(goal != state.goal)
     value, age = jax.lax.cond(due, solve, lambda: (kept.value, kept.age))
-    return kept._replace(value=value, age=age)
+    return kept._replace(value=value, age=age, goal=jnp.where(due, goal, state.goal))
 
 
 def beyond(spec: MemorySpec, state: MemoryState, shape: tuple[int, int], pooling: int) -> Float[Array, "h w"]:

@@ -100,7 +100,7 @@ class MppiState(NamedTuple):
 class Info(NamedTuple):
     """What one looks at."""
 
-    failed: Array  # [] bool, every trajectory collides: the command brakes
+    failed: Array  # [] bool, every trajectory collides or has no finite cost: the command brakes
     cost: Array  # [] least J of the last update
     chosen: Array  # [C] terms of the cost, averaged over the samples as the update weights them
     best: Array  # [n, C] terms of the n best samples, the best first
@@ -123,7 +123,8 @@ def init(spec: MppiSpec, params: MppiParams, key: PRNGKeyArray) -> MppiState:
 def clamp(
     limits: Limits, control: Float[Array, "T 2"], twist: Float[Array, "2"], dt: float
 ) -> Float[Array, "T 2"]:
-    """The clamps of (3)."""
+    """The clamps of (3); what is not finite becomes braking."""
+    control = jnp.where(jnp.isfinite(control), control, 0.0)
     up, down, turn = limits.a_max * dt, -limits.a_min * dt, limits.alpha_max * dt
     v = jnp.clip(control[:, 0], limits.v_min, limits.v_max)
     w = jnp.clip(control[:, 1], -limits.w_max, limits.w_max)
@@ -148,9 +149,12 @@ def update(
     twist: Float[Array, "2"],
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, "T 2"], Info]:
-    """Equations (1) and (2), once. Arguments as in `plan`; eps is taken times sign; the key is for the disturbances."""
+    """Equations (1) and (2), once. Arguments as in `plan`; eps is taken times sign; the key is for the disturbances.
+
+    A sample whose cost is not finite has no weight.
+    """
     sigma = jnp.stack([jnp.asarray(params.std_v, jnp.float32), jnp.asarray(params.std_w, jnp.float32)]) * sign
-    pull = (params.gamma / sigma)[None, :]
+    pull = jnp.where(sigma != 0.0, params.gamma / jnp.where(sigma != 0.0, sigma, 1.0), 0.0)[None, :]
     deviation, wanted = eps, control
     if spec.rate_space:
         deviation = jnp.cumsum(eps, axis=0) * spec.dt
@@ -168,15 +172,19 @@ def update(
         step = spec.dt * sigma[None, :]
         bent = jnp.square(step)[:, :, None] * jnp.square(eps) + 2.0 * (step * spec.dt * wanted)[:, :, None] * eps
         total = total + params.change * jnp.sum(bent, axis=(0, 1))
+    priced_well = jnp.isfinite(total)
+    worst = jnp.max(jnp.where(priced_well, total, -jnp.inf))
+    total = jnp.where(priced_well, total, jnp.where(jnp.isfinite(worst), worst, 0.0))
     temperature = jnp.asarray(params.temperature, jnp.float32)
     if spec.adapt_temperature:
         temperature = mppi_weights.temperature_for(total, params.effective_share)
-    weight = mppi_weights.softmin(total, temperature)
+    total = jnp.where(priced_well | ~jnp.isfinite(worst), total, jnp.inf)
+    weight, terms = mppi_weights.softmin(total, temperature), jnp.where(jnp.isfinite(priced.terms), priced.terms, 0.0)
     control = control + sigma[None, :] * (deviation @ weight)
     least, index = jax.lax.top_k(-total, spec.num_explained)
     return control, Info(
-        failed=jnp.all(priced.collides), cost=jnp.min(total), chosen=priced.terms @ weight,
-        best=priced.terms[:, index].T, best_index=index.astype(jnp.int32), best_cost=-least,
+        failed=jnp.all(priced.collides | ~priced_well), cost=jnp.min(total), chosen=terms @ weight,
+        best=terms[:, index].T, best_index=index.astype(jnp.int32), best_cost=-least,
         effective=mppi_weights.effective_size(weight), temperature=temperature,
     )  # fmt: skip
 

@@ -34,8 +34,8 @@ def tail_mean(priced: Priced, num: int, tail: Scalar) -> Priced:
 
 
 def softmin(cost: Float[Array, " K"], temperature: Scalar) -> Float[Array, " K"]:
-    """Weights of equation (1)."""
-    weight = jnp.exp((jnp.min(cost) - cost) / temperature)
+    """Weights of equation (1); at a temperature of 0 the best sample's alone."""
+    weight = jnp.exp((jnp.min(cost) - cost) / jnp.maximum(temperature, 1e-12))
     return weight / jnp.sum(weight)
 
 

@@ -2,8 +2,9 @@
 
 An episode is an outer scan over replans and an inner scan over ticks (so `replan` is static), `chunk_ticks` ticks at a
 time. A host loop calls chunks until every episode is over and keeps what is finished. Episodes of a batch are worked on
-`lanes` at a time (vmapped), one group after another: on a CPU small groups stay in the cache and finished ones are
-skipped; on an accelerator one wide group is best. The policy comes as functions: nothing here knows a planner.
+`lanes` at a time (vmapped), one group after another: on a CPU one lane stays in the cache and what is over is skipped;
+on an accelerator one wide group is best, which runs until its last episode is over. The policy comes as functions: nothing
+here knows a planner.
 """
 
 import dataclasses
@@ -214,7 +215,7 @@ def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys:
 def _chunk_batch(
     spec: EpisodeSpec, policy: Policy, params: EpisodeParams, state: EpisodeState
 ) -> tuple[EpisodeState, Log]:
-    """One chunk of every episode of the batch; groups that are over are skipped."""
+    """One chunk of every episode of the batch; with one lane those that are over are skipped."""
     one = lambda p, s: chunk(spec, policy, p, s)  # noqa: E731
     empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(one, *_first((params, state)))[1])
 

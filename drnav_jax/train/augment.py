@@ -32,7 +32,7 @@ class AugmentParams(NamedTuple):
     black: Scalar = 0.15  # [] some pixels are black
     black_share: Scalar = 0.25  # [] at most so many of them
     no_rule: Scalar = 0.1  # [] the geometric rule is silent
-    light: Scalar = 0.15  # [] standard deviation of gain and offset of the images
+    light: Scalar = 0.15  # [] standard deviation of the gain of the images
     shift: Scalar = 0.03  # [] standard deviation of what is wrong with a camera's position [m]
     turn: Scalar = 0.015  # [] and with its rotation [rad]
 

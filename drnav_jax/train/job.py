@@ -68,20 +68,26 @@ class _Log:
         self._board.close()
 
 
-def _begin(folder: Path, spec: TrainSpec, resume: bool) -> None:
-    """The folder of the run, with its settings beside it."""
+def _begin(folder: Path, spec: TrainSpec, data: dict[str, Any] | None, resume: bool) -> None:
+    """The folder of the run, with its settings and what its frames are beside it."""
     folder.mkdir(parents=True, exist_ok=True)
-    file, text = folder / "spec.json", json.dumps(settings.plain(spec), indent=1, sort_keys=True) + "\n"
-    if file.exists():
-        if not resume:
-            raise ValueError(f"{folder} holds a run already: give --resume to go on with it, or another --out.")
-        held = json.loads(file.read_text())
-        other = sorted(k for k, v in json.loads(text).items() if held.get(k) != v)
-        if other:
-            raise ValueError(f"{folder} was begun with another {', '.join(other)}: give the same, or another --out.")
-    elif resume:
+    begun = (folder / "spec.json").exists()
+    if begun and not resume:
+        raise ValueError(f"{folder} holds a run already: give --resume to go on with it, or another --out.")
+    if resume and not begun:
         raise ValueError(f"{folder} holds no run to resume.")
-    file.write_text(text)
+    texts = {"spec": json.dumps(settings.plain(spec), indent=1, sort_keys=True) + "\n"}
+    if data is not None:
+        texts["data"] = json.dumps(data, indent=1, sort_keys=True) + "\n"
+    for name, text in texts.items():
+        file, now = folder / f"{name}.json", json.loads(text)
+        was = json.loads(file.read_text()) if file.exists() else now
+        other = sorted(k for k in was | now if was.get(k) != now.get(k))
+        if other:
+            what = "" if name == "spec" else " data"
+            raise ValueError(f"{folder} was begun with another {', '.join(other)}{what}: give the same, or another --out.")
+    for name, text in texts.items():
+        (folder / f"{name}.json").write_text(text)
 
 
 def train(
@@ -106,7 +112,7 @@ def train(
         OSError: If the weights to start from cannot be read.
     """
     state = init(spec)
-    _begin(out, spec, resume)
+    _begin(out, spec, data, resume)
     mesh = mesh_of(jax.devices() if devices is None else devices, spec.batch_size)
     kept = Checkpoints(out, spec.keep)
     if resume and kept.latest is not None:
@@ -131,7 +137,8 @@ def train(
                     progress(step, latest)
             if step % spec.validate_every == 0 or step == spec.steps:
                 paused = time.perf_counter()
-                figures = validate.figures(validate.predict(spec.network, jax.device_get(state.average), validation))
+                found = validate.predict(spec.network, jax.device_get(state.average), validation)
+                figures = validate.figures(found, spec.network.bev.resolution)
                 log(step, "validation", figures)
                 kept.offer(state, float(np.nanmean([figures[name] for name in SCORED])))
                 if progress is not None:
@@ -143,8 +150,8 @@ def train(
         temper = fitted(spec, best.average, validation)
         found = validate.predict(spec.network, best.average, validation, temper)
         result = Result(
-            params=best.average, calibration=temper, figures=validate.figures(found), step=int(best.step),
-            samples_per_s=latest.get("samples_per_s", 0.0),
+            params=best.average, calibration=temper, figures=validate.figures(found, spec.network.bev.resolution),
+            step=int(best.step), samples_per_s=latest.get("samples_per_s", 0.0),
         )  # fmt: skip
         about = {"figures": result.figures, "step": result.step, "data": data or {}, "run": _plain(spec)}
         weights.save(out / "weights.safetensors", spec.network, best.average, temper, about)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from drnav_jax import metrics
+from drnav_jax.filter.dead_end import DeadEndParams, log_odds, probability
 from drnav_jax.models import calibration, fusion, network
 from drnav_jax.models.batch import NEVER, OCCUPIED, Batch, Inputs, Targets
 from drnav_jax.models.calibration import Calibration
@@ -23,7 +24,7 @@ from drnav_jax.worlds.labels import clearance_of
 from drnav_jax.worlds.openings import Floor, openings
 
 RAW = Calibration()
-NEAR_SEEN = fusion.NEAR  # [m] never-seen cells count this close to seen ones; farther off no evidence is used
+NEAR_SEEN = fusion.NEAR  # [m] never-seen cells count this close to seen ones
 
 
 class Predictions(NamedTuple):
@@ -69,13 +70,18 @@ def joined(parts: list[Predictions]) -> Predictions:
 
 
 def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Predictions:
-    """What the geometric rule says; of ways, what its verdict on the known map leaves open, unknown counting as free."""
+    """What the geometric rule says; of ways, what its verdict on the known map leaves open, unknown counting as free.
+
+    Of a cell it says what the filter makes of one answer (eq. 5 of the paper), so that where it is silent the prior stands.
+    """
     parts, pose = [], np.zeros((1, 3))
+    prior = log_odds(DeadEndParams().prior)
     for batch in batches:
         path, flag = [], []
         x = batch.inputs
         p = np.asarray(x.rule_p).astype(np.float32) / 255
         sure = np.asarray(x.rule_confidence).astype(np.float32) / 255
+        dead = np.asarray(probability(prior + sure * (log_odds(jnp.asarray(p)) - prior)))
         closed = (p > 0.1) & (sure > 0)  # the rule knows two answers: see `GeometricParams`
         for verdict, known in zip(closed, np.asarray(x.local_map), strict=True):
             floor = Floor(
@@ -86,7 +92,7 @@ def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Prediction
             path.append(found.open[0])
             flag.append(found.dead_end[0])
         parts.append(Predictions(
-            np.asarray(path, np.float32), np.asarray(flag, np.float32), np.round(p * sure * 65535).astype(np.uint16),
+            np.asarray(path, np.float32), np.asarray(flag, np.float32), np.round(dead * 65535).astype(np.uint16),
             jax.tree.map(np.asarray, batch.targets),
         ))  # fmt: skip
     return joined(parts)

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from drnav_jax import dataset, worlds
 from drnav_jax.dataset import collect, gather, shards
-from drnav_jax.dataset.frames import STRATUM_BITS, Frame, FrameSpec, dtypes
+from drnav_jax.dataset.frames import STRATUM_BITS, FrameSpec, dtypes
 from drnav_jax.dataset.shards import DatasetSpec
 from drnav_jax.models import bev
 from drnav_jax.sim.lidar import LidarSpec
@@ -25,8 +25,7 @@ DATA = DatasetSpec(48, "train", 0, ("u", "t"), ticks=5, num_worlds=8, per_world=
 
 @pytest.fixture(scope="module")
 def frames():
-    fields = shards.checked(gather.shard(DATA, SPEC, 0), DATA.shard_size)
-    return Frame(**fields)
+    return gather.shard(DATA, SPEC, 0)
 
 
 def test_fields_have_the_shapes_and_types_of_storage(frames):

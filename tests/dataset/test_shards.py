@@ -146,7 +146,8 @@ def test_pairs_cover_families_and_behaviours_evenly():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"num_frames": 0}, "num_frames"), ({"seed": -1}, "seed >= 0"), ({"ticks": 0}, "ticks"),
+        ({"num_frames": 0}, "num_frames"), ({"seed": -1}, "seed within"),
+        ({"seed": 2147}, "seed within 0..2146"), ({"ticks": 0}, "ticks"),
         ({"num_worlds": 12}, "multiple of 8"),
         ({"split": "all"}, "train, val, test"), ({"families": ()}, "at least one family"),
     ],

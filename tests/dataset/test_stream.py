@@ -69,6 +69,25 @@ def test_it_begins_with_the_round_it_needs_and_reads_one_ahead(asked):
     assert not any(main for _, main in asked), "a thread gathers"
 
 
+def test_who_leaves_waits_for_no_more_than_the_shard_at_hand(monkeypatch):
+    numbers, begun, go = [], threading.Event(), threading.Event()
+
+    def shard(data, spec, number):
+        numbers.append(number)
+        if number >= TOGETHER:
+            begun.set()
+            assert go.wait(30)
+        return Frame(**dict.fromkeys(Frame._fields, np.zeros(SIZE, np.uint8)))
+
+    monkeypatch.setattr(gather, "shard", shard)
+    frames = stream(PER_BATCH, DATA, FrameSpec())
+    next(frames)
+    assert begun.wait(30)
+    threading.Timer(0.2, go.set).start()
+    frames.close()
+    assert numbers == list(range(TOGETHER + 1))
+
+
 @pytest.mark.parametrize("size", [0, -1, TOGETHER * SIZE + 1])
 def test_a_batch_that_no_round_can_hold(asked, size):
     with pytest.raises(ValueError, match=f"batch_size must lie within 1..{TOGETHER * SIZE}"):

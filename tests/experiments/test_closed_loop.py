@@ -1,5 +1,6 @@
 """The closed-loop experiment: which trips it makes, and how it judges drives and beliefs."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
@@ -75,6 +76,8 @@ def test_groups_are_families_in_turn():
     [
         ({"trips": 0}, "trips must"), ({"groups": ("t+l",)}, "WORLDS@RANGE"), ({"groups": ("t@50",)}, "lidar_range"),
         ({"rows": ("drnav:magic",)}, "no predictor"), ({"rows": ("fly:none",)}, "no planner"), ({"rows": ()}, "rows"),
+        ({"groups": ("t+tt@6",)}, '"tt" of the group'), ({"groups": ("../maps/none.yaml@12",)}, "neither a family"),
+        ({"split": "all"}, "split must be one of"), ({"weights": Path("none.safetensors")}, "no file of weights"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_refused(changes, says):

@@ -1,5 +1,6 @@
 """The experiment on recorded frames: one command gives figures and pictures, from any weights."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -70,6 +71,19 @@ def test_figures_count_what_they_say():
     assert found["free_said_traversable"] == pytest.approx(2 / 3)
     assert found["occupied_said_not_traversable"] == pytest.approx(2 / 3)
     assert found["p_open"]["front"] == 0.5 and not found["dead_end"] and found["finite"]
+
+
+def test_the_bag_is_read_as_the_flags_say(tmp_path):
+    """Frames of a robot with odometry, of a LiDAR whose ground is not looked for; a topic that is named, and not there."""
+    bag = small_bag.write(tmp_path / "bag", small_bag.drive(2))
+    config = Config(data=bag, base_frame="lidar", base_height=0.9, body=0.5, shape=(16, 24), level=False)
+    found = real_frames.chosen(config)
+    assert len(found) == 2 and all(frame.ground is None for frame in found)
+    np.testing.assert_array_equal([frame.observation.pose for frame in found], np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="has no topic /nowhere for LiDAR"):
+        real_frames.chosen(dataclasses.replace(config, points="/nowhere"))
+    with pytest.raises(ValueError, match="has no topic /nowhere for camera"):
+        real_frames.chosen(dataclasses.replace(config, images=("/nowhere",)))
 
 
 def test_counts_are_checked():

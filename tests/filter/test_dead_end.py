@@ -187,6 +187,15 @@ def test_footprint_equals_scipy():
     np.testing.assert_allclose(np.asarray(got), want, atol=1e-6)
 
 
+@pytest.mark.parametrize(("radius", "resolution"), [(0.25, 0.1), (0.35, 0.1), (0.25, 0.05), (0.35, 0.02)])
+def test_the_kernel_holds_the_robot_on_cells_of_any_size(radius, resolution):
+    """Beside a half plane that is dead, cell by cell: the share of the disc in it, by its segment's area."""
+    values = jnp.zeros((121, 121), jnp.float32).at[:, 61:].set(1.0)
+    got = np.asarray(dead_end.footprint(values, radius, resolution, half_width=dead_end.half_width(resolution)))[60]
+    d = np.clip(((60.5 - np.arange(121)) * resolution) / radius, -1, 1)
+    np.testing.assert_allclose(got[30:91], ((np.arccos(d) - d * np.sqrt(1 - d * d)) / np.pi)[30:91], atol=0.03)
+
+
 def test_polygon_kernel():
     square = jnp.asarray([[0.15, 0.15], [-0.15, 0.15], [-0.15, -0.15], [0.15, -0.15]], jnp.float32)
     kernel = np.asarray(dead_end.polygon_kernel(square, 0.0, 0.1, 2))

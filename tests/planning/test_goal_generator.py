@@ -169,6 +169,14 @@ def test_when_all_is_blocked_it_says_so_and_stays():
     assert bool(jnp.all(jnp.isfinite(jnp.stack([got.exposure, *got.xy]))))
 
 
+@pytest.mark.parametrize(("away", "horizon"), [(0.5, 0.5), (1.0, 0.7), (1.0, 4.0)])
+def test_no_heading_leaps_over_a_wall(away, horizon):
+    """A wall 15 cm thick across the way, which a ray in steps of a metre would not see."""
+    x, _ = centres()
+    got = choose(field((x > away) & (x < away + 0.15)), params=PARAMS._replace(horizon=f32(horizon)))
+    assert float(got.xy[0]) < away
+
+
 def test_what_nobody_generated_is_the_goal_itself():
     got = goal_generator.given(SPEC, f32([3.0, -1.0]))
     chex.assert_trees_all_equal_shapes_and_dtypes(got, choose(field()))

@@ -97,7 +97,7 @@ def test_moving_there_and_back_loses_only_what_left_the_memory():
 
 def test_it_is_solved_when_it_is_due():
     spec = MemorySpec(cells=24, pooling=4, solve_every=3)
-    held = write(memory.init(spec), room(), spec=spec)
+    held = write(memory.init(spec), room(), spec=spec, goal=(1.8, 1.2))
     assert float(held.value.max()) > 0, "at once the first time"
     values = []
     for _ in range(6):
@@ -108,6 +108,8 @@ def test_it_is_solved_when_it_is_due():
     moved = memory.shift(spec, held, jnp.asarray([8, 0], jnp.int32))
     again = write(moved, np.ones(GRID.shape, bool), origin=ORIGIN + np.array([0.0, 0.8]), spec=spec, goal=(1.8, 1.2))
     assert float(jnp.abs(again.value - moved.value).max()) > 0, "and at once after a move"
+    other = write(again, np.ones(GRID.shape, bool), origin=ORIGIN + np.array([0.0, 0.8]), spec=spec, goal=(-1.8, 1.2))
+    assert float(jnp.abs(other.value - again.value).max()) > 1.0, "and for another goal"
 
 
 def test_a_goal_beyond_the_memory_is_reached_over_its_rim():
@@ -122,13 +124,14 @@ def test_a_goal_beyond_the_memory_is_reached_over_its_rim():
     [
         ({"cells": 7}, GRID, "cells must be even"),
         ({"solve_every": 0}, GRID, "sizes >= 1"),
-        ({"cells": 24, "pooling": 3}, GRID, "must divide the window's stride 8"),
+        ({"cells": 24, "pooling": 16}, GRID, "must divide the window's stride 8"),
+        ({"cells": 24, "pooling": 1}, GRID, "must be a multiple of the route's, 2"),
         ({"cells": 8, "pooling": 4}, GRID, "smaller than the window"),
     ],
 )
 def test_a_memory_that_does_not_fit_is_refused(spec, grid, message):
     with pytest.raises(ValueError, match=message):
-        memory.check(MemorySpec(**spec), grid)
+        memory.check(MemorySpec(**spec), grid, 2)
 
 
 def test_one_trace_and_a_batch_equals_single_calls():

@@ -152,6 +152,8 @@ def test_it_refuses_what_is_not_its_own(whole, validation, tmp_path):
     other = TrainSpec(**{**TRAIN.__dict__, "learning_rate": 1e-3, "seed": 4})
     with pytest.raises(ValueError, match="begun with another learning_rate, seed:"):
         run(out, validation, resume=True, spec=other)
+    with pytest.raises(ValueError, match="begun with another seed data:"):
+        run(out, validation, resume=True, data={"seed": 8})
     with pytest.raises(ValueError, match="holds no run to resume"):
         run(tmp_path / "none", validation, resume=True)
 

@@ -71,6 +71,23 @@ def test_never_seen_cells_near_to_seen_ones():
     assert near[0, 2].tolist() == [False] + [True] * 4 + [False] * 25
 
 
+def test_the_rule_says_of_a_cell_what_the_filter_makes_of_it():
+    """Where it is silent the prior stands; what it calls open lies below that, what it calls shut above."""
+    held = batch(1)
+    p = np.zeros(held.inputs.rule_p.shape, np.uint8)
+    sure = np.zeros_like(p)
+    p[0, 0, :3], sure[0, 0, :3] = (64, 8, 8), (255, 51, 255)
+    held = held._replace(inputs=held.inputs._replace(rule_p=p, rule_confidence=sure))
+    found = validate.by_rule([held], SPEC.bev, 0.25)
+    logit = lambda q: np.log(q / (1 - q))  # noqa: E731
+    want = [logit(0.06) + c * (logit(q / 255) - logit(0.06)) for q, c in ((64, 1), (8, 0.2), (8, 1))]
+    assert found.dead is not None
+    np.testing.assert_allclose(logit(found.dead[0, 0, :3] / 65535), want, atol=1e-3)
+    rest = found.dead.copy()
+    rest[0, 0, :3] = round(0.06 * 65535)
+    np.testing.assert_array_equal(rest, round(0.06 * 65535))
+
+
 def test_who_says_nothing_of_cells():
     got = validate.figures(judged()._replace(dead=None))
     assert all(np.isnan(got[name]) for name in CELLS) and got["accuracy"] == validate.figures(judged())["accuracy"]
