@@ -100,7 +100,7 @@ def ratio_of_means(
         level: Of the interval.
 
     Returns:
-        (ratio, lower, upper).
+        (ratio, lower, upper); a bound is inf where samples so far out hold nothing but zeros of theirs.
 
     Raises:
         ValueError: If the samples are not paired or empty, or all of theirs are 0.
@@ -113,7 +113,8 @@ def ratio_of_means(
     draw = np.random.default_rng(seed).integers(0, ours.size, (resamples, ours.size))
     with np.errstate(divide="ignore", invalid="ignore"):  # a sample may hold nothing but zeros of theirs, or of both
         ratios = ours[draw].mean(axis=1) / theirs[draw].mean(axis=1)
-    low, high = np.quantile(ratios[~np.isnan(ratios)], [(1 - level) / 2, (1 + level) / 2])
+        low, high = np.quantile(ratios[~np.isnan(ratios)], [(1 - level) / 2, (1 + level) / 2])
+    low, high = (np.inf if np.isnan(bound) else bound for bound in (low, high))  # between inf and inf
     return float(ours.mean() / theirs.mean()), float(low), float(high)
 
 

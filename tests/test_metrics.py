@@ -61,6 +61,9 @@ def test_ratio_of_means_is_paired():
     ratio, low, high = metrics.ratio_of_means(ours, theirs)
     assert ratio == pytest.approx(ours.mean() / theirs.mean()) and low < ratio < high < 0.6
     assert metrics.ratio_of_means(ours, theirs) == (ratio, low, high)  # seeded
+    with np.errstate(all="raise"):  # half of the samples hold none of theirs
+        one = metrics.ratio_of_means(np.ones(20), np.eye(20)[0])
+    assert one[0] == 20 and 0 < one[1] < 20 and one[2] == np.inf
     for wrong in (np.ones(3), np.ones((40, 1))):
         with pytest.raises(ValueError, match="paired"):
             metrics.ratio_of_means(wrong, theirs)
