@@ -181,7 +181,7 @@ class Observation(NamedTuple):
     pose: Array  # [3] x, y, yaw in odom
     twist: Array  # [2] measured v [m/s], omega [rad/s]
     goal: Array  # [2] x, y in odom [m]
-    image_age: Array  # [N] time since capture [s]; what is too old counts as missing (`NavParams.max_age`)
+    image_age: Array  # [N] time since capture [s], or [0]: just now; what is too old counts as missing (`NavParams.max_age`)
     point_age: Array  # [] time since the scan [s]
     rig: CameraRig  # where the cameras sit and look
 
@@ -230,7 +230,9 @@ def sane(
     pose_ok = jnp.all(jnp.isfinite(seen.pose))
     pose = jnp.where(pose_ok, seen.pose, pose)
     valid = seen.point_valid & jnp.all(jnp.isfinite(seen.points), axis=-1) & pose_ok & (seen.point_age <= max_age)
-    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3)) & (seen.image_age <= max_age)
+    image_ok = jnp.all(jnp.isfinite(seen.images), axis=(1, 2, 3))
+    if seen.image_age.shape == image_ok.shape:  # who gives images and no ages has fresh ones
+        image_ok &= seen.image_age <= max_age
     return seen._replace(
         pose=pose,
         twist=jnp.where(jnp.all(jnp.isfinite(seen.twist)), seen.twist, twist),

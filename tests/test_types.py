@@ -48,6 +48,8 @@ def test_what_is_too_old_is_missing():
         kept, healthy = sane(aged, seen.pose, seen.twist, 0.5)
         assert bool(healthy) and kept.image_valid.tolist() == [bool(w) for w in want]
         assert kept.point_valid.tolist() == [point_age <= 0.5] * 2
+    kept, _ = sane(seen._replace(image_age=jnp.zeros(0, jnp.float32)), seen.pose, seen.twist, 0.5)
+    assert kept.image_valid.tolist() == [True] * 3, "without ages they are fresh"
 
 
 def test_a_rig_looks_where_its_mounts_say():
