@@ -181,7 +181,7 @@ class Observation(NamedTuple):
     pose: Array  # [3] x, y, yaw in odom
     twist: Array  # [2] measured v [m/s], omega [rad/s]
     goal: Array  # [2] x, y in odom [m]
-    image_age: Array  # [N] time since capture [s], or [0]: just now; what is too old counts as missing (`NavParams.max_age`)
+    image_age: Array  # [N] time since capture [s], or [0]: none; what is too old counts as missing (`NavParams.max_age`)
     point_age: Array  # [] time since the scan [s]
     rig: CameraRig  # where the cameras sit and look
 
