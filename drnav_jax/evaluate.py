@@ -89,6 +89,8 @@ class Setup:
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and low <= value <= high):
                 raise ValueError(f"{name} must lie within {low}..{high} {unit}".rstrip() + f", got {value}.")
+        if self.weights is not None and not self.weights.is_file():
+            raise ValueError(f"{self.weights} is no file of weights.")
         if self.num_candidates < 320:
             raise ValueError(f"num_candidates must be >= 320, got {self.num_candidates}.")
 
@@ -288,15 +290,13 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
     if setup.evidence == "oracle":
         labels = _pad_maps([label_map(t, setup.robot_radius) for t in trips])
         each = [p._replace(predictor=oracle.OracleParams(label=m)) for p, m in zip(each, labels, strict=True)]
-    batch = len(trips)
-    spread = lambda tree: _stack([tree] * batch)  # noqa: E731
+    spread = lambda tree: _stack([tree] * len(trips))  # noqa: E731
     physics = equipped(EpisodeSpec(), setup).physics
     every = [t.scene.world for t in trips]
     solids = () if physics is None else mjx.solids_of(every, physics)
     return EpisodeParams(
         world=worlds.stack_worlds(every),
-        start=_float32([t.scene.start for t in trips]),
-        goal=_float32([t.scene.goal for t in trips]),
+        start=_float32([t.scene.start for t in trips]), goal=_float32([t.scene.goal for t in trips]),
         time_limit=_float32([t.time_limit for t in trips]), goal_tolerance=_float32([t.goal_tolerance for t in trips]),
         robot=spread(params.robot), policy=_stack(each), faults=spread(episode.FaultParams()), solids=solids,
         lidar=spread(LidarParams(max_range=setup.lidar_range)),

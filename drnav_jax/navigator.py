@@ -131,8 +131,12 @@ class NavState(NamedTuple):
     latency: LatencyState
     local_goal: Array  # [2] the last g* [m]
     last_pose: Array  # [3] the last finite pose
-    last_command: Array  # [2] v, omega
     time: Array  # [] [s]
+
+    @property
+    def last_command(self) -> Array:
+        """v, omega `[2]`."""
+        return self.latency.sent[0]
 
 
 class Info(NamedTuple):
@@ -171,9 +175,7 @@ def init(spec: NavSpec, params: NavParams, pose: Float[Array, "3"]) -> NavState:
         follower=follower.init(spec.follower, spec.planner, params.follower, pose),
         latency=latency.init(),
         local_goal=pose[:2],
-        last_pose=pose,
-        last_command=jnp.zeros(2, jnp.float32),
-        time=jnp.zeros((), jnp.float32),
+        last_pose=pose, time=jnp.zeros((), jnp.float32),
     )
 
 
@@ -364,7 +366,7 @@ def _act(
     )  # fmt: skip
     state = state._replace(
         belief=held, recovery=recover, follower=following, local_goal=choice.xy,
-        latency=latency.sent(state.latency, command), last_command=jnp.stack(command), time=time + spec.dt,
+        latency=latency.sent(state.latency, command), time=time + spec.dt,
     )  # fmt: skip
     return state, command, info
 

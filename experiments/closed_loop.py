@@ -71,8 +71,6 @@ class Config:
             raise ValueError("trips must be >= 1, watched >= 0, and there must be rows and groups.")
         if self.split not in worlds.SPLITS:
             raise ValueError(f'split must be one of {", ".join(worlds.SPLITS)}, got "{self.split}".')
-        if self.weights is not None and not self.weights.is_file():
-            raise ValueError(f"{self.weights} is no file of weights.")
         for group in self.groups:
             range_of(group)
             named = group.rpartition("@")[0]

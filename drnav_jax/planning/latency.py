@@ -13,10 +13,10 @@ d commands under way will have brought the robot (Smith 1957). A robot that obey
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from drnav_jax import geometry
 from drnav_jax.planning import dynamics
 from drnav_jax.types import Command, RobotParams, Scalar
 
@@ -80,14 +80,12 @@ def ahead(
         robot: Limits.
         dt: Tick [s].
     """
+    m = dynamics.start(pose, twist, 1)
     for k in range(MAX_TICKS - 1, -1, -1):  # the oldest first
-        given = dynamics.limit(state.sent[k, 0], state.sent[k, 1], twist, robot, dt)
-        middle, turn = pose[2] + 0.5 * given.omega * dt, given.omega * dt
-        step = jnp.stack([given.v * dt * jnp.cos(middle), given.v * dt * jnp.sin(middle), turn])
-        moved = (pose + step).at[2].set(geometry.wrap_angle(pose[2] + turn))
-        under_way = k < state.ticks
-        pose, twist = jnp.where(under_way, moved, pose), jnp.where(under_way, jnp.stack(given), twist)
-    return pose, twist
+        moved = dynamics.advance(m, state.sent[k, 0], state.sent[k, 1], robot, dt)
+        m = jax.tree.map(lambda a, b, k=k: jnp.where(k < state.ticks, a, b), moved, m)
+    late, there = state.ticks > 0, jnp.concatenate([m.x, m.y, jnp.arctan2(m.s, m.c)])
+    return jnp.where(late, there, pose), jnp.where(late, jnp.concatenate([m.v, m.w]), twist)
 
 
 def sent(state: LatencyState, command: Command) -> LatencyState:

@@ -55,7 +55,7 @@ def init(spec: MemorySpec) -> MemoryState:
     """Nothing known: all free."""
     free = jnp.ones((spec.cells, spec.cells), bool)
     zero = jnp.zeros(free.shape, jnp.float32)
-    return MemoryState(free, free, free, zero, jnp.zeros((), jnp.int32), jnp.zeros(2, jnp.float32))
+    return MemoryState(free, free, free, zero, jnp.zeros((), jnp.int32), jnp.full(2, grids.UNREACHABLE, jnp.float32))
 
 
 def check(spec: MemorySpec, grid: GridSpec, pooling: int) -> None:
@@ -131,7 +131,7 @@ def update(
         value = grids.cost_to_go(cost, initial, resolution=size, east=kept.east, north=kept.north)
         return value, jnp.zeros((), jnp.int32)
 
-    due = (kept.age >= spec.solve_every) | (state.age == 0) & jnp.all(state.value == 0) | jnp.any(goal != state.goal)
+    due = (kept.age >= spec.solve_every) | jnp.any(goal != state.goal)  # at first it is solved for no goal
     value, age = jax.lax.cond(due, solve, lambda: (kept.value, kept.age))
     return kept._replace(value=value, age=age, goal=jnp.where(due, goal, state.goal))
 

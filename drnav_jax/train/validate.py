@@ -14,12 +14,13 @@ import numpy as np
 from scipy import ndimage
 
 from drnav_jax import metrics
-from drnav_jax.filter.dead_end import DeadEndParams, log_odds, probability
+from drnav_jax.filter import dead_end
+from drnav_jax.filter.dead_end import DeadEndParams
 from drnav_jax.models import calibration, fusion, network
 from drnav_jax.models.batch import NEVER, OCCUPIED, Batch, Inputs, Targets
 from drnav_jax.models.calibration import Calibration
 from drnav_jax.models.network import NetworkSpec
-from drnav_jax.types import BevSpec
+from drnav_jax.types import BevSpec, Evidence
 from drnav_jax.worlds.labels import clearance_of
 from drnav_jax.worlds.openings import Floor, openings
 
@@ -75,13 +76,15 @@ def by_rule(batches: Iterable[Batch], bev: BevSpec, radius: float) -> Prediction
     Of a cell it says what the filter makes of one answer (eq. 5 of the paper), so that where it is silent the prior stands.
     """
     parts, pose = [], np.zeros((1, 3))
-    prior = log_odds(DeadEndParams().prior)
+    belief = DeadEndParams()
+    once = jax.vmap(lambda before, said: dead_end.update(belief, before, said, said.confidence > 0, 0.0))
     for batch in batches:
         path, flag = [], []
         x = batch.inputs
         p = np.asarray(x.rule_p).astype(np.float32) / 255
         sure = np.asarray(x.rule_confidence).astype(np.float32) / 255
-        dead = np.asarray(probability(prior + sure * (log_odds(jnp.asarray(p)) - prior)))
+        blank = jnp.full(p.shape, dead_end.prior_log_odds(belief))
+        dead = np.asarray(dead_end.probability(once(blank, Evidence(jnp.asarray(p), jnp.asarray(sure)))))
         closed = (p > 0.1) & (sure > 0)  # the rule knows two answers: see `GeometricParams`
         for verdict, known in zip(closed, np.asarray(x.local_map), strict=True):
             floor = Floor(
