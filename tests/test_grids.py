@@ -207,3 +207,21 @@ def test_batches_equal_loops_and_every_verb_is_traced_once():
         ),
     ]:
         chex.assert_trees_all_equal(jnp.stack([one(k) for k in range(3)]), many)
+
+
+def test_the_least_come_first_and_of_equals_the_first():
+    values = f32([3.0, 1.0, np.inf, 1.0, -2.0, 1.0])
+    found, index = grids.least(values, 4)
+    np.testing.assert_array_equal(found, [-2.0, 1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(index, [4, 1, 3, 5])
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="What is compiled into what differs: run it on a CPU.")
+def test_who_looks_at_one_of_the_least_does_not_sort_them_all():
+    def two_ways(values, pick):
+        index = pick(values)
+        return index, index[0]
+
+    sorts = lambda pick: " sort(" in jax.jit(lambda v: two_ways(v, pick)).lower(jnp.ones(512)).compile().as_text()  # noqa: E731
+    assert sorts(lambda v: jax.lax.top_k(-v, 10)[1])  # or the barrier is needed no longer
+    assert not sorts(lambda v: grids.least(v, 10)[1])

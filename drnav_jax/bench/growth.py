@@ -56,7 +56,7 @@ def _scores(drive: Drive, words: GridMap, num: int, steps: int, robots: int = 0)
     chosen = candidates(drive.params, *drive.stops[0], num)
     params = drive.params.score._replace(horizon=jnp.asarray(0.1 * steps, jnp.float32))
 
-    def score(words: GridMap, chosen: scoring.Candidates, params: scoring.ScoreParams) -> scoring.Scores:
+    def score(words: GridMap, chosen: scoring.Candidates, params: scoring.ScoreParams) -> jax.Array:
         return scoring.score(words, chosen, params, drive.params.robot, dt=0.1, num_steps=steps)
 
     if not robots:

@@ -4,6 +4,7 @@ One program of XLA's runs the kernel on one thread of a CPU; where threads share
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,13 +25,14 @@ THREADS = {4096: 1, 65536: 2}  # that share so many candidates
 
 
 def candidates(params: NavParams, seen: Observation, state: NavState, num: int) -> scoring.Candidates:
-    """`num` candidates of a moving robot at a stop of a drive."""
+    """`num` controls of a moving robot at a stop of a drive: every speed with every turn rate."""
     speeds = 16 if num <= 4096 else 64
-    spec = GeneratorSpec(num_speeds=speeds, num_turns=(num - 256) // speeds, num_headings=256)
+    spec = GeneratorSpec(num_speeds=speeds, num_turns=num // speeds)
     twist = jnp.asarray([0.6, 0.4], jnp.float32)
-    return goal_generator.candidates(
+    controls, _ = goal_generator.candidates(
         spec, params.score, params.robot, seen.pose, twist, seen.goal, state.local_goal, params.hysteresis
     )
+    return controls
 
 
 def _read(layers: tuple[GridMap, GridMap, GridMap], at: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
@@ -48,18 +50,19 @@ def _read(layers: tuple[GridMap, GridMap, GridMap], at: tuple[jax.Array, jax.Arr
 BILINEAR = scoring.Reader(lambda layers: (jnp.zeros(2, jnp.float32), 1.0), lambda layers, x, y: (x, y), _read)
 
 
-def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[str, float], float]:
+def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, dict[str, float]], dict[str, float], float]:
     """Candidate-steps per second of `scoring.score`, its error, and the time of the reference matmul [ms].
 
     T = `NUM_STEPS` steps of 0.1 s, risk and obstacle cost, limited in acceleration from a moving state, in the field
-    that the navigator makes. The error is that of nearest packed look-ups against bilinear look-ups in float, over all
-    stops of the drive.
+    that the navigator makes. Rates are those of the generator's controls (`product`), and of as many candidates that
+    nothing is known of (`list`). The error is that of nearest packed look-ups against bilinear look-ups in float, over
+    all stops of the drive.
     """
     params = drive.params.score._replace(horizon=jnp.asarray(0.1 * NUM_STEPS, jnp.float32))
     field_of = jax.jit(navigator.rollout_field, static_argnums=0)
     cell = drive.spec.filter.grid.resolution
 
-    def score(field: Any, chosen: scoring.Candidates, **how: Any) -> scoring.Scores:
+    def score(field: Any, chosen: scoring.Candidates, **how: Any) -> jax.Array:
         return scoring.score(field, chosen, params, drive.params.robot, dt=0.1, num_steps=NUM_STEPS, **how)
 
     pairs = []
@@ -69,20 +72,23 @@ def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, float], dict[st
         value = GridMap(costmap.unpack(state.plan)[2], window, cell)
         chosen = candidates(drive.params, seen, state, 4096)
         smooth = score((clear, GridMap(state.risk, window, cell), value), chosen, reader=BILINEAR)
-        pairs.append((np.asarray(score(words, chosen).score, float), np.asarray(smooth.score, float)))
+        pairs.append((np.asarray(score(words, chosen), float).ravel(), np.asarray(smooth, float).ravel()))
 
     words = field_of(drive.spec, drive.params, drive.stops[0][1])[1]
-    calls = [_scorer(words, candidates(drive.params, *drive.stops[0], n), params, drive.params, n) for n in THREADS]
+    products = [candidates(drive.params, *drive.stops[0], n) for n in THREADS]
+    lists = [scoring.at(some, jnp.arange(n)) for some, n in zip(products, THREADS, strict=True)]
+    calls = [_scorer(words, some, params, drive.params) for some in (*products, *lists)]
     *seconds, reference = interleaved([*calls, matmul()], repeats)
-    rates = {str(n): n * NUM_STEPS / s for n, s in zip(THREADS, seconds, strict=True)}
-    return rates, _difference(pairs), 1e3 * reference
+    rates = [n * NUM_STEPS / s for n, s in zip([*THREADS] * 2, seconds, strict=True)]
+    named = [dict(zip(map(str, THREADS), part, strict=True)) for part in (rates[: len(THREADS)], rates[len(THREADS) :])]
+    return {"product": named[0], "list": named[1]}, _difference(pairs), 1e3 * reference
 
 
 def _scorer(
-    words: GridMap, chosen: scoring.Candidates, weights: scoring.ScoreParams, params: NavParams, num: int
-) -> Callable[[], scoring.Scores]:
-    """Scores `num` candidates on as many threads as they get."""
-    workers = THREADS[num]
+    words: GridMap, chosen: scoring.Candidates, weights: scoring.ScoreParams, params: NavParams
+) -> Callable[[], jax.Array]:
+    """Scores candidates on as many threads as they get."""
+    workers = THREADS[math.prod(chosen.shape)]
     score = scoring.score if workers == 1 else functools.partial(scoring.score_on_threads, workers=workers)
     return lambda: score(words, chosen, weights, params.robot, dt=0.1, num_steps=NUM_STEPS)
 

@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from drnav_jax import grids
 from drnav_jax.planning import dwb_critics, dynamics
 from drnav_jax.planning.dwb_critics import DwbParams, DwbState, Trajectories
 from drnav_jax.planning.path import Path
@@ -210,12 +211,12 @@ def plan(
     terms = judged.scale[:, None] * jnp.where(asked, judged.raw, 0.0)
     legal = used & jnp.all(judged.legal | ~asked, axis=0)
     total = jnp.where(legal, jnp.sum(terms, axis=0), jnp.inf)
-    least, index = jax.lax.top_k(-total, spec.num_explained)  # of equals the first comes first
+    least, index = grids.least(total, spec.num_explained)
     failed = ~jnp.any(legal)
     sent = jnp.where(failed, 0.0, jnp.stack([v[index[0]], w[index[0]]]))
     state = dwb_critics.remember(params, state, pose, sent)
     return state, Command(v=sent[0], omega=sent[1]), Info(
-        failed=failed, cost=-least[0], chosen=terms[:, index[0]], best=terms[:, index].T,
-        best_index=index.astype(jnp.int32), best_cost=-least, num_legal=jnp.sum(legal.astype(jnp.int32)),
+        failed=failed, cost=least[0], chosen=terms[:, index[0]], best=terms[:, index].T,
+        best_index=index.astype(jnp.int32), best_cost=least, num_legal=jnp.sum(legal.astype(jnp.int32)),
         illegal=jnp.sum((asked & ~judged.legal & used[None, :]).astype(jnp.int32), axis=1),
     )  # fmt: skip

@@ -6,6 +6,7 @@ the goal are headings of their own, so a choice is kept unless something is bett
 """
 
 import dataclasses
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drnav_jax import geometry
+from drnav_jax import geometry, grids
 from drnav_jax.planning import dynamics, scoring
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.planning.scoring import BLOCKED, Candidates, ScoreParams, Terms
@@ -82,14 +83,11 @@ def candidates(
     goal: Float[Array, "2"],
     last: Float[Array, "2"],
     hysteresis: Scalar,
-) -> Candidates:
-    """The K candidates: controls first, then headings, then the last g*, then the goal."""
-    controls = spec.num_speeds * spec.num_turns
+) -> tuple[Candidates, Candidates]:
+    """Speeds `[num_speeds, 1]` by turn rates `[1, num_turns]`; headings `[num_headings]`, last g* and goal at the end."""
     fan = spec.num_headings - 2
-    share = (jnp.arange(controls, dtype=jnp.float32) // max(spec.num_turns, 1) + 1.0) / max(spec.num_speeds, 1)
-    turn = jnp.linspace(-1.0, 1.0, max(spec.num_turns, 1), dtype=jnp.float32)
-    v = share * robot.v_max
-    w = jnp.tile(turn, spec.num_speeds)[:controls] * robot.w_max
+    share = (jnp.arange(spec.num_speeds, dtype=jnp.float32) + 1.0) / max(spec.num_speeds, 1)
+    turn = jnp.linspace(-1.0, 1.0, max(spec.num_turns, 1), dtype=jnp.float32)[: spec.num_turns]
     targets = jnp.stack([last, goal]) - pose[None, :2]
     yaw = jnp.concatenate(
         [jnp.arange(fan, dtype=jnp.float32) * (2 * jnp.pi / fan), jnp.arctan2(targets[:, 1], targets[:, 0])]
@@ -103,19 +101,26 @@ def candidates(
     pace = jnp.minimum(ends / params.horizon, widest)
     # near the last g* there is nothing left to hold on to, or the robot would settle there
     held = hysteresis * jnp.square(jnp.clip(span[0] / params.range_min, 0.0, 1.0))
-    here = dynamics.start(pose, twist, controls)
-    none = jnp.zeros(spec.num_headings, jnp.float32)
+    one, none = jnp.zeros((1, 1), jnp.float32), jnp.zeros(spec.num_headings, jnp.float32)
+    controls = Candidates(
+        motion=jax.tree.map(lambda a: a[None], dynamics.start(pose, twist, 1)),
+        v=(share * robot.v_max)[:, None], w=(turn * robot.w_max)[None],
+        turned=one, reach=one + params.range_max, bias=one + params.curved,
+    )  # fmt: skip
     rays = Motion(x=none + pose[0], y=none + pose[1], c=jnp.cos(yaw), s=jnp.sin(yaw), v=pace, w=none)
-    join = lambda a, b: jnp.concatenate([a, b])  # noqa: E731
-    one = jnp.zeros(controls, jnp.float32)
-    return Candidates(
-        motion=jax.tree.map(join, here, rays),
-        v=join(v, pace),
-        w=join(w, none),
-        turned=join(one, jnp.abs(geometry.wrap_angle(yaw - pose[2]))),
-        reach=join(one + params.range_max, reach),
-        bias=join(one + params.curved, none.at[fan].set(-held)),
-    )
+    turned = jnp.abs(geometry.wrap_angle(yaw - pose[2]))
+    return controls, Candidates(rays, v=pace, w=none, turned=turned, reach=reach, bias=none.at[fan].set(-held))
+
+
+def at(ways: tuple[Candidates, Candidates], index: Array) -> Candidates:
+    """Candidates `index` `[n]` (or one, `[]`), counted over the controls, row by row, then over the headings."""
+    controls, headings = ways
+    count, index = math.prod(controls.shape), jnp.atleast_1d(index)
+    rays = scoring.at(headings, jnp.maximum(index - count, 0))
+    if not count:
+        return rays
+    arcs = scoring.at(controls, jnp.minimum(index, count - 1))
+    return jax.tree.map(lambda a, b: jnp.where(index < count, a, b), arcs, rays)
 
 
 def given(spec: GeneratorSpec, xy: Float[Array, "2"]) -> LocalGoal:
@@ -153,13 +158,12 @@ def generate(
         last: The last g* [m].
         hysteresis: Advantage of the last g* [m].
     """
-    chosen_from = candidates(spec, params, robot, pose, twist, goal, last, hysteresis)
-    scores = scoring.score(field, chosen_from, params, robot, dt=spec.dt, num_steps=spec.num_steps)
-    # of equals the first comes first; what is looked at of one costs as much as of ten
-    _, order = jax.lax.top_k(-scores.score, min(spec.num_explained, spec.num_candidates))
-    best, terms = scoring.explain(
-        field, scoring.at(chosen_from, order), params, robot, dt=spec.dt, num_steps=spec.num_steps
-    )
+    ways = candidates(spec, params, robot, pose, twist, goal, last, hysteresis)
+    how = {"dt": spec.dt, "num_steps": spec.num_steps}
+    scores = [jnp.ravel(scoring.score(field, part, params, robot, **how)) for part in ways]
+    # what is looked at of one costs as much as of ten
+    _, order = grids.least(jnp.concatenate(scores), min(spec.num_explained, spec.num_candidates))
+    best, terms = scoring.explain(field, at(ways, order), params, robot, **how)
     valid = best.score[0] < BLOCKED
     return LocalGoal(
         xy=jnp.where(valid, jnp.stack([best.x[0], best.y[0]]), pose[:2]),

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from drnav_jax import grids
 from drnav_jax.planning import dynamics, mppi_rollout, mppi_weights, noise, savitzky_golay
 from drnav_jax.planning.mppi_rollout import Cost, Limits
 from drnav_jax.planning.noise import NoiseParams, NoiseSpec
@@ -181,10 +182,10 @@ def update(
     total = jnp.where(priced_well | ~jnp.isfinite(worst), total, jnp.inf)
     weight, terms = mppi_weights.softmin(total, temperature), jnp.where(jnp.isfinite(priced.terms), priced.terms, 0.0)
     control = control + sigma[None, :] * (deviation @ weight)
-    least, index = jax.lax.top_k(-total, spec.num_explained)
+    least, index = grids.least(total, spec.num_explained)
     return control, Info(
         failed=jnp.all(priced.collides | ~priced_well), cost=jnp.min(total), chosen=terms @ weight,
-        best=terms[:, index].T, best_index=index.astype(jnp.int32), best_cost=-least,
+        best=terms[:, index].T, best_index=index.astype(jnp.int32), best_cost=least,
         effective=mppi_weights.effective_size(weight), temperature=temperature,
     )  # fmt: skip
 

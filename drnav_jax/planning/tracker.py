@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from drnav_jax import geometry
+from drnav_jax import geometry, grids
 from drnav_jax.planning import dynamics
 from drnav_jax.planning.dynamics import Motion
 from drnav_jax.types import Command, GridMap, RobotParams, Scalar
@@ -213,11 +213,11 @@ def track(
     way, cost = jnp.argmin(cost, axis=0), jnp.min(cost, axis=0)
     cost = jnp.where(certified, cost, jnp.inf)
     count = v.shape[0]
-    least_cost, order = jax.lax.top_k(-cost, min(spec.num_explained, count))  # of equals the first comes first
+    least_cost, order = grids.least(cost, min(spec.num_explained, count))
     k, best = order[0], terms[:, way[order] * count + order].T
     any_certified = jnp.any(certified)
     command = dynamics.limit(
         jnp.where(any_certified, v[k], 0.0), jnp.where(any_certified, w[k], 0.0), twist, robot, dt
     )
-    critics = Critics(chosen=best[0], best=best, best_cost=-least_cost)
+    critics = Critics(chosen=best[0], best=best, best_cost=least_cost)
     return Track(command=command, certified=any_certified, cost=cost[k], clearance=least[k], critics=critics)

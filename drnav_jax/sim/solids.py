@@ -2,11 +2,11 @@
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from drnav_jax import grids
 from drnav_jax.worlds.rectangles import wall_boxes
 from drnav_jax.worlds.world import FAR, World, blocking
 
@@ -75,7 +75,7 @@ def nearest(solids: Solids, xy: Float[Array, "2"], num_boxes: int, num_posts: in
         if rows.shape[0] < count:
             far = jnp.asarray([BEYOND, BEYOND, *[1.0] * (rows.shape[1] - 2)], jnp.float32)
             return jnp.concatenate([rows, jnp.tile(far[None], (count - rows.shape[0], 1))])
-        return rows[jax.lax.top_k(-distance, count)[1]]
+        return rows[grids.least(distance, count)[1]]
 
     shift = xy[None]
     boxes = jnp.concatenate([solids.boxes[:, :2] - shift, solids.boxes[:, 2:]], axis=1)

@@ -52,7 +52,8 @@ def choose(words, goal=(20.0, 0.0), last=(0.0, 0.0), hysteresis=0.3, pose=HERE, 
 
 def everything(words, goal=(20.0, 0.0), last=(0.0, 0.0), hysteresis=0.3, params=PARAMS):
     ways = goal_generator.candidates(SPEC, params, ROBOT, f32(HERE), f32(STILL), f32(goal), f32(last), f32(hysteresis))
-    return ways, scoring.score(words, ways, params, ROBOT, dt=SPEC.dt, num_steps=SPEC.num_steps)
+    every = goal_generator.at(ways, jnp.arange(SPEC.num_candidates))
+    return every, scoring.explain(words, every, params, ROBOT, dt=SPEC.dt, num_steps=SPEC.num_steps)[0]
 
 
 @pytest.mark.parametrize(("speeds", "turns", "headings"), [(4, 9, 38), (0, 9, 38), (3, 0, 5), (1, 1, 3)])
@@ -60,8 +61,10 @@ def test_there_are_as_many_candidates_as_the_spec_says(speeds, turns, headings):
     spec = GeneratorSpec(num_speeds=speeds, num_turns=turns, num_headings=headings)
     goal, last = f32([3.0, 4.0]), f32([0.0, -2.0])
     ways = goal_generator.candidates(spec, PARAMS, ROBOT, f32([1, 1, 0.3]), f32(STILL), goal, last, f32(0.3))
-    assert all(a.shape == (spec.num_candidates,) for a in jax.tree.leaves(ways))
+    assert [part.shape for part in ways] == [(speeds, turns), (headings,)]
     assert spec.num_candidates == speeds * turns + headings
+    ways = goal_generator.at(ways, jnp.arange(spec.num_candidates))
+    assert all(a.shape == (spec.num_candidates,) for a in jax.tree.leaves(ways))
     controls = speeds * turns
     v, w = np.asarray(ways.v)[:controls], np.asarray(ways.w)[:controls]
     assert len({*zip(v.tolist(), w.tolist(), strict=True)}) == controls

@@ -74,8 +74,8 @@ def run(field, candidates, params=PARAMS, num_steps=STEPS, **static):
     """Scores looked at (`Best`), after a check that the scores alone are the same."""
     best, _ = explain(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps)
     alone = score(field, candidates, params, ROBOT, dt=DT, num_steps=num_steps, **static)
-    chex.assert_trees_all_close(alone.score, best.score, atol=1e-5)
-    return jax.device_get(best._replace(score=alone.score))
+    chex.assert_trees_all_close(alone, best.score, atol=1e-5)
+    return jax.device_get(best._replace(score=alone))
 
 
 VARIANTS = [
@@ -226,9 +226,29 @@ def test_the_size_of_blocks_changes_nothing(size):
     chex.assert_trees_all_close(run(field, candidates, block_size=size), run(field, candidates), atol=1e-6)
 
 
+def product(seed, speeds=7, turns=9):
+    """Candidates of one robot, every speed with every turn rate: as arrays that broadcast, and written out."""
+    some = population(seed, max(speeds, turns))
+    first = jax.tree.map(lambda a: a[:1, None], some)
+    few = first._replace(v=some.v[:speeds, None], w=some.w[None, :turns], bias=some.bias[None, :turns])
+    return few, jax.tree.map(lambda a: jnp.broadcast_to(a, (speeds, turns)).reshape(-1), few)
+
+
+@pytest.mark.parametrize("size", [None, 27, 8])  # all at once; three rows, three rows, one; row by row
+def test_a_product_is_the_list_of_its_pairs(size):
+    field, (few, listed) = world(16), product(16)
+    assert few.shape == (7, 9) and listed.shape == (63,)
+    got = score(field, few, PARAMS, ROBOT, dt=DT, num_steps=STEPS, block_size=size)
+    assert got.shape == (7, 9) and 0 < int((got < BLOCKED).sum())
+    chex.assert_trees_all_close(got.reshape(-1), run(field, listed).score, atol=1e-6)
+    chosen = jnp.asarray([62, 0, 13])
+    chex.assert_trees_all_equal(scoring.at(few, chosen), scoring.at(listed, chosen))
+
+
 @pytest.mark.parametrize("workers", [1, 2, 4])
-def test_the_number_of_threads_changes_nothing(workers):
-    field, candidates = world(9), population(9)
+@pytest.mark.parametrize("kind", ["list", "product"])
+def test_the_number_of_threads_changes_nothing(workers, kind):
+    field, candidates = world(9), population(9) if kind == "list" else product(9)[0]
     how = {"dt": DT, "num_steps": STEPS}
     shared = scoring.score_on_threads(field, candidates, PARAMS, ROBOT, workers=workers, **how)
     chex.assert_trees_all_close(shared, score(field, candidates, PARAMS, ROBOT, **how), atol=1e-6)
@@ -236,15 +256,14 @@ def test_the_number_of_threads_changes_nothing(workers):
 
 def test_the_step_leads_to_the_end():
     field, candidates = world(12), population(12)
-    got, alone = run(field, candidates), score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
-    alone, free = jax.device_get(alone), 0
+    got, free = run(field, candidates), 0
     for k in range(NUM):
         if float(got.score[k]) == BLOCKED:
-            assert int(alone.step[k]) == 0
+            assert int(got.step[k]) == 0
             continue
         free += 1
         path = path_of(candidates, jnp.int32(k))
-        np.testing.assert_allclose(path[int(alone.step[k]) - 1], [got.x[k], got.y[k]], atol=1e-5)
+        np.testing.assert_allclose(path[int(got.step[k]) - 1], [got.x[k], got.y[k]], atol=1e-5)
     assert 0.2 * NUM < free < NUM
 
 
@@ -280,7 +299,7 @@ def test_another_reader_may_read_other_layers():
     )
     got = score(layers, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS, reader=reader)
     want = score(field, candidates, PARAMS, ROBOT, dt=DT, num_steps=STEPS)
-    error = np.abs(np.asarray(got.score) - np.asarray(want.score))
+    error = np.abs(np.asarray(got) - np.asarray(want))
     assert np.mean(error > TOLERANCE) < 0.02  # poses on a border between cells
 
 
@@ -302,11 +321,11 @@ def test_one_trace_for_a_sweep_over_weights():
     seen = set()
     for k in range(3):
         params = PARAMS._replace(risk_weight=f32(k), decay=f32(0.1 * k), horizon=f32(4 - k), range_max=f32(5 - k))
-        seen.add(float(once(world(k), population(k), params, ROBOT, dt=DT, num_steps=STEPS).score[5]))
+        seen.add(float(once(world(k), population(k), params, ROBOT, dt=DT, num_steps=STEPS)[5]))
     assert len(seen) == 3
     score_of = lambda lam: score(  # noqa: E731
         world(1), population(1), PARAMS._replace(risk_weight=lam), ROBOT, dt=DT, num_steps=STEPS
-    ).score
+    )
     sweep = jax.vmap(score_of)(f32([0, 1, 4]))
     for lam, row in zip((0.0, 1.0, 4.0), sweep, strict=True):
         chex.assert_trees_all_close(row, score_of(f32(lam)), atol=1e-5)
