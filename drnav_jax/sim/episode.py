@@ -2,9 +2,8 @@
 
 An episode is an outer scan over replans and an inner scan over ticks (so `replan` is static), `chunk_ticks` ticks at a
 time. A host loop calls chunks until every episode is over and keeps what is finished. Episodes of a batch are worked on
-`lanes` at a time (vmapped), one group after another: on a CPU one lane stays in the cache and what is over is skipped;
-on an accelerator one wide group is best, which runs until its last episode is over. The policy comes as functions: nothing
-here knows a planner.
+`lanes` at a time (vmapped), one group after another to its end: on a CPU one lane stays in the cache, on an accelerator one
+wide group is best. So one program serves batches of any size. The policy comes as functions: nothing here knows a planner.
 """
 
 import dataclasses
@@ -206,23 +205,23 @@ def chunk(
     return state, jax.tree.map(lambda a: a.reshape(spec.chunk_ticks, *a.shape[2:]), log)
 
 
+def _each(one: Callable, *trees: Any) -> Any:
+    """`one` for every episode of a group, side by side; an episode that is alone needs no `vmap`."""
+    if jax.tree.leaves(trees)[0].shape[0] > 1:
+        return jax.vmap(one)(*trees)
+    return jax.tree.map(lambda a: a[None], one(*_first(trees)))
+
+
 @partial(jax.jit, static_argnames=("spec", "policy"))
-def _start_batch(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: Key[Array, " B"]) -> EpisodeState:
-    return jax.lax.map(lambda a: start(spec, policy, *a), (params, keys), batch_size=spec.lanes)
+def _start_group(spec: EpisodeSpec, policy: Policy, params: EpisodeParams, keys: Key[Array, " B"]) -> EpisodeState:
+    return _each(lambda p, key: start(spec, policy, p, key), params, keys)
 
 
 @partial(jax.jit, static_argnames=("spec", "policy"), donate_argnames="state")
-def _chunk_batch(
+def _chunk_group(
     spec: EpisodeSpec, policy: Policy, params: EpisodeParams, state: EpisodeState
 ) -> tuple[EpisodeState, Log]:
-    """One chunk of every episode of the batch; with one lane those that are over are skipped."""
-    one = lambda p, s: chunk(spec, policy, p, s)  # noqa: E731
-    empty = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(one, *_first((params, state)))[1])
-
-    def group(args: tuple[EpisodeParams, EpisodeState]) -> tuple[EpisodeState, Log]:
-        return jax.lax.cond(args[1].active, one, lambda p, s: (s, empty), *args)
-
-    return jax.lax.map(group, (params, state), batch_size=spec.lanes if spec.lanes > 1 else None)
+    return _each(lambda p, s: chunk(spec, policy, p, s), params, state)
 
 
 def _first(tree: Any) -> Any:
@@ -270,47 +269,53 @@ def run(
     if spec.rig.mounts and not params.camera:
         raise ValueError("cameras need EpisodeParams.camera (CameraParams).")
     count = keys.shape[0]
-    shards = [np.arange(k, count, workers) for k in range(min(workers, count))]
-    done, stop, compiling = [0] * len(shards), threading.Event(), threading.Lock()
+    # the last group is filled up with its last episode again
+    groups = [np.minimum(np.arange(k, k + spec.lanes), count - 1) for k in range(0, count, spec.lanes)]
+    done, stop, compiling = [0] * len(groups), threading.Event(), threading.Lock()
 
     def work(which: int) -> tuple[EpisodeState, Log]:
-        index = shards[which]
-        mine = jax.tree.map(lambda a: jnp.asarray(a)[index], (params, keys))
+        index, fresh = groups[which], min(spec.lanes, count - which * spec.lanes)
+        mine = jax.tree.map(lambda a: jnp.asarray(a[index]), (params, keys))
         with compiling:  # one after the other, or each thread would compile the same programs
-            state, log = _chunk_batch(spec, policy, mine[0], _start_batch(spec, policy, *mine))
-        logs = []
-        while True:
+            state, logs = _start_group(spec, policy, *mine), []
+            begun = None if stop.is_set() else _chunk_group(spec, policy, mine[0], state)
+        if begun is None:
+            shapes = jax.eval_shape(partial(_chunk_group, spec, policy), mine[0], state)[1]
+            logs.append(jax.tree.map(lambda a: np.zeros((a.shape[0], 0, *a.shape[2:]), a.dtype), shapes))
+        while begun is not None:
+            state, log = begun
             logs.append(jax.device_get(log))
-            done[which] = int(np.sum(~np.asarray(state.active)))
+            going = np.asarray(state.active)
+            done[which] = int(np.sum(~going[:fresh]))
             if progress is not None:
                 progress(sum(done))
-            if stop.is_set() or not bool(jnp.any(state.active)):
-                break
-            state, log = _chunk_batch(spec, policy, mine[0], state)
+            begun = _chunk_group(spec, policy, mine[0], state) if going.any() and not stop.is_set() else None
         state = state._replace(policy=None, key=jax.random.key_data(state.key))
-        return jax.device_get(state), jax.tree.map(lambda *a: np.concatenate(a, axis=1), *logs)
+        log = jax.tree.map(lambda *a: np.concatenate(a, axis=1), *logs)
+        return jax.tree.map(lambda a: a[:fresh], (jax.device_get(state), log))
 
-    with ThreadPoolExecutor(len(shards)) as pool:
-        futures = [pool.submit(work, k) for k in range(len(shards))]
+    with ThreadPoolExecutor(min(workers, len(groups))) as pool:
+        futures = [pool.submit(work, k) for k in range(len(groups))]
         try:
             while not all(f.done() for f in futures):
                 threading.Event().wait(0.05)
+                if any(f.done() and f.exception() for f in futures):
+                    stop.set()
         except KeyboardInterrupt:
             stop.set()
         parts = [f.result() for f in futures]
-    return _join(parts, shards)
+    return _join(parts)
 
 
-def _join(parts: list[tuple[EpisodeState, Log]], shards: list[np.ndarray]) -> Result:
-    """Put the shards' episodes back in order; logs are padded to the longest."""
-    order = np.argsort(np.concatenate(shards))
+def _join(parts: list[tuple[EpisodeState, Log]]) -> Result:
+    """The groups' episodes one after the other; logs are padded to the longest."""
     longest = max(log.active.shape[1] for _, log in parts)
 
     def pad(a: np.ndarray) -> np.ndarray:
         return np.pad(a, [(0, 0), (0, longest - a.shape[1])] + [(0, 0)] * (a.ndim - 2))
 
-    state = jax.tree.map(lambda *a: np.concatenate(a)[order], *[s for s, _ in parts])
-    log = jax.tree.map(lambda *a: np.concatenate([pad(x) for x in a])[order], *[log for _, log in parts])
+    state = jax.tree.map(lambda *a: np.concatenate(a), *[s for s, _ in parts])
+    log = jax.tree.map(lambda *a: np.concatenate([pad(x) for x in a]), *[log for _, log in parts])
     return Result(state=state, log=log, finished=~state.active)
 
 
@@ -319,8 +324,8 @@ def replay(
 ) -> Iterator[EpisodeState]:
     """One episode again, chunk by chunk, with the policy's whole state: for pictures of what it believed."""
     single = jax.tree.map(lambda a: jnp.asarray(a)[None], (params, key))
-    state = _start_batch(spec, policy, *single)
+    state = _start_group(spec, policy, *single)
     yield _first(state)
     while bool(state.active[0]):
-        state, _ = _chunk_batch(spec, policy, single[0], state)
+        state, _ = _chunk_group(spec, policy, single[0], state)
         yield _first(jax.tree.map(jnp.copy, state))

@@ -228,14 +228,26 @@ def test_an_interrupt_keeps_what_is_finished():
 
     def progress(done):
         counts.append(done)
-        if len(counts) == 2:  # let the main thread come to wait
+        if len(counts) == 5:  # let the main thread come to wait
             time.sleep(0.3)
             signal.raise_signal(signal.SIGINT)
 
-    result = episode.run(SPEC, POLICY, batch([rows[0]] * 2 + [rows[1]] * 2), keys(4), workers=2, progress=progress)
-    np.testing.assert_array_equal(result.finished, [True, True, False, False])
-    assert result.state.collision[:2].all() and (result.state.tick[2:] > 0).all()
-    assert max(counts) == 2
+    result = episode.run(SPEC, POLICY, batch([rows[0]] * 2 + [rows[1]] * 4), keys(6), workers=2, progress=progress)
+    np.testing.assert_array_equal(result.finished, [True, True, False, False, False, False])
+    assert result.state.collision[:2].all() and max(counts) == 2
+    assert (result.state.tick[2:4] > 0).all(), "under way"
+    assert (result.state.tick[4:] == 0).all() and not result.log.active[4:].any(), "not begun"
+
+
+def test_an_error_ends_the_run():
+    def broken(*args):
+        jax.debug.callback(lambda: (_ for _ in ()).throw(OSError("no disk")))
+        return step(*args)
+
+    counts = []
+    with pytest.raises(Exception, match="no disk"):
+        episode.run(SPEC, Policy(init, broken), batch([ROWS[ARRIVES]] * 9), keys(9), progress=counts.append)
+    assert len(counts) < 9
 
 
 @pytest.mark.parametrize(
