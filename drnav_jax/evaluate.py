@@ -295,7 +295,7 @@ def episode_params(trips: list[Trip], setup: Setup, params: NavParams | None = N
     every = [t.scene.world for t in trips]
     solids = () if physics is None else mjx.solids_of(every, physics)
     return EpisodeParams(
-        world=worlds.stack_worlds(every),
+        world=worlds.stack_worlds(every, multiple_of=16),  # similar trips share compiled programs
         start=_float32([t.scene.start for t in trips]), goal=_float32([t.scene.goal for t in trips]),
         time_limit=_float32([t.time_limit for t in trips]), goal_tolerance=_float32([t.goal_tolerance for t in trips]),
         robot=spread(params.robot), policy=_stack(each), faults=spread(episode.FaultParams()), solids=solids,
