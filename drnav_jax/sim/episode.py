@@ -269,12 +269,13 @@ def run(
     if spec.rig.mounts and not params.camera:
         raise ValueError("cameras need EpisodeParams.camera (CameraParams).")
     count = keys.shape[0]
+    lanes = min(spec.lanes, count)
     # the last group is filled up with its last episode again
-    groups = [np.minimum(np.arange(k, k + spec.lanes), count - 1) for k in range(0, count, spec.lanes)]
+    groups = [np.minimum(np.arange(k, k + lanes), count - 1) for k in range(0, count, lanes)]
     done, stop, compiling = [0] * len(groups), threading.Event(), threading.Lock()
 
     def work(which: int) -> tuple[EpisodeState, Log]:
-        index, fresh = groups[which], min(spec.lanes, count - which * spec.lanes)
+        index, fresh = groups[which], min(lanes, count - which * lanes)
         mine = jax.tree.map(lambda a: jnp.asarray(a[index]), (params, keys))
         with compiling:  # one after the other, or each thread would compile the same programs
             state, logs = _start_group(spec, policy, *mine), []
