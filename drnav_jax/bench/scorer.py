@@ -79,9 +79,9 @@ def scoring_times(drive: Drive, repeats: int) -> tuple[dict[str, dict[str, float
     lists = [scoring.at(some, jnp.arange(n)) for some, n in zip(products, THREADS, strict=True)]
     calls = [_scorer(words, some, params, drive.params) for some in (*products, *lists)]
     *seconds, reference = interleaved([*calls, matmul()], repeats)
-    rates = [n * NUM_STEPS / s for n, s in zip([*THREADS] * 2, seconds, strict=True)]
-    named = [dict(zip(map(str, THREADS), part, strict=True)) for part in (rates[: len(THREADS)], rates[len(THREADS) :])]
-    return {"product": named[0], "list": named[1]}, _difference(pairs), 1e3 * reference
+    rate = lambda spent: {str(n): n * NUM_STEPS / s for n, s in zip(THREADS, spent, strict=True)}  # noqa: E731
+    rates = {"product": rate(seconds[: len(products)]), "list": rate(seconds[len(products) :])}
+    return rates, _difference(pairs), 1e3 * reference
 
 
 def _scorer(

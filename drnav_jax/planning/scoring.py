@@ -88,8 +88,15 @@ class Candidates(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of them all."""
-        return jnp.broadcast_shapes(*map(jnp.shape, jax.tree.leaves(self)))
+        """Of them all.
+
+        Raises:
+            ValueError: If not all arrays have as many axes: nobody could tell rows from columns.
+        """
+        shapes = [jnp.shape(a) for a in jax.tree.leaves(self)]
+        if len({len(shape) for shape in shapes}) > 1:
+            raise ValueError(f"all arrays of Candidates need as many axes, such as [S, 1] and [1, N], got {shapes}.")
+        return jnp.broadcast_shapes(*shapes)
 
 
 class Best(NamedTuple):
@@ -270,7 +277,7 @@ def score(
 def _rows(candidates: Candidates, first: Array | int, num: int) -> Candidates:
     """Those of `num` places along the first axis."""
     count = candidates.shape[0]
-    cut = lambda a: jax.lax.dynamic_slice_in_dim(a, first, num) if a.shape[:1] == (count,) else a  # noqa: E731
+    cut = lambda a: jax.lax.dynamic_slice_in_dim(a, first, num) if a.shape[0] == count else a  # noqa: E731
     return jax.tree.map(cut, candidates)
 
 

@@ -245,6 +245,12 @@ def test_a_product_is_the_list_of_its_pairs(size):
     chex.assert_trees_all_equal(scoring.at(few, chosen), scoring.at(listed, chosen))
 
 
+def test_arrays_of_other_axes_are_refused():
+    few, _ = product(16, 7, 7)
+    with pytest.raises(ValueError, match=r"as many axes, such as \[S, 1\] and \[1, N\]"):
+        score(world(16), few._replace(bias=few.bias[0]), PARAMS, ROBOT, dt=DT, num_steps=STEPS)
+
+
 @pytest.mark.parametrize("workers", [1, 2, 4])
 @pytest.mark.parametrize("kind", ["list", "product"])
 def test_the_number_of_threads_changes_nothing(workers, kind):
